@@ -1,0 +1,1 @@
+"""File formats: scenes (PLY), cameras (transforms.json, COLMAP), images, semantics."""
