@@ -1,0 +1,135 @@
+"""Front-to-back compositing, block schedule (CUDA): 256 threads own a 16 x 16 tile and stage its fragments in batches.
+
+The arithmetic of a pixel is that of the lane schedule (`transmittance.py`). On the CPU these kernels run as
+cooperative fibers when `wp.config.enable_cpu_blocks` is set; that is how they are tested without a GPU. With the flag
+off Warp would run them with blocks of one thread, so the host never launches them then.
+"""
+
+from functools import cache
+
+import warp as wp
+
+from sgwarp.kernels.binning import TILE, Fragment
+from sgwarp.kernels.projection import Knobs
+from sgwarp.kernels.transmittance import BLOCK_OPTIONS, LANES, Lanes, alpha_from_level, attenuated, contribution
+
+wp.set_module_options(BLOCK_OPTIONS)
+
+BLOCK = 256  # threads, one per pixel of a tile
+STAGE = 64  # fragments staged at a time
+
+
+@wp.func
+def alpha_at(f: Fragment, column: int, row: int, knobs: Knobs) -> float:
+    """Opacity of a fragment at a pixel of its tile."""
+    dy = float(row) - f.y
+    v = f.c * dy
+    u = f.b * dy - f.a * f.x + f.a * float(column)
+    return alpha_from_level(f.level - v * v - u * u, knobs)
+
+
+@cache
+def make_composite_colors_block(depth: bool) -> wp.Kernel:
+    """Block-schedule counterpart of `make_composite_colors`."""
+
+    @wp.kernel(module="unique", module_options=BLOCK_OPTIONS, enable_backward=False)
+    def composite_colors_block(
+        # In:
+        offsets: wp.array[int],  # [tiles + 1] first fragment of each tile
+        fragments: wp.array[Fragment],  # [I]
+        knobs: Knobs,
+        width: int,  # [pixels]
+        height: int,
+        # Out:
+        colors_out: wp.array2d[wp.vec3],  # [H, W] sum of alpha T color
+        transmittance_out: wp.array2d[float],  # [H, W]
+        depth_sum_out: wp.array2d[float],  # [H, W] sum of alpha T z [m]
+        surface_out: wp.array2d[float],  # [H, W] z where accumulated opacity passes alpha_d [m], 0 = no hit
+    ):
+        """Paper eq. 1; one block per tile."""
+        tile, t = wp.tid()
+        columns = (width + TILE - 1) / TILE
+        column = t % TILE
+        row = t / TILE
+        x = (tile % columns) * TILE + column
+        y = (tile / columns) * TILE + row
+        inside = x < width and y < height
+        T = wp.where(inside, 1.0, 0.0)
+        color = wp.vec3(0.0, 0.0, 0.0)
+        depth_sum = float(0.0)
+        surface = float(0.0)
+        last = offsets[tile + 1]
+        for start in range(offsets[tile], last, STAGE):
+            staged = wp.tile_load(fragments, shape=STAGE, offset=start, storage="shared")
+            for j in range(wp.min(STAGE, last - start)):
+                f = staged[j]
+                alpha = alpha_at(f, column, row, knobs)
+                w = contribution(alpha, T, knobs)
+                color += w * f.color
+                if wp.static(depth):
+                    depth_sum += w * f.depth
+                    behind = T - alpha * T
+                    if T > knobs.surface_transmittance and behind <= knobs.surface_transmittance:
+                        surface = f.depth
+                T = attenuated(alpha, T, knobs)
+            open_pixels = wp.tile_sum(wp.tile(wp.where(T > 0.0, 1, 0)))
+            if open_pixels[0] == 0:
+                break
+        if inside:
+            colors_out[y, x] = color
+            transmittance_out[y, x] = wp.abs(T)
+            if wp.static(depth):
+                depth_sum_out[y, x] = depth_sum
+                surface_out[y, x] = surface
+
+    return composite_colors_block
+
+
+@cache
+def make_composite_features_block() -> wp.Kernel:
+    """Block-schedule counterpart of `make_composite_features`; every block composites 16 channels of a tile."""
+
+    @wp.kernel(module="unique", module_options=BLOCK_OPTIONS, enable_backward=False)
+    def composite_features_block(
+        # In:
+        offsets: wp.array[int],  # [tiles + 1]
+        fragments: wp.array[Fragment],  # [I]
+        features: wp.array2d[Lanes],  # [N, S] channels in slices of 16
+        knobs: Knobs,
+        width: int,
+        height: int,
+        # Out:
+        features_out: wp.array3d[float],  # [H, W, C] sum of alpha T x
+        transmittance_out: wp.array2d[float],  # [H, W]
+    ):
+        """Paper eq. 1 for any number of channels; one block per (tile, slice)."""
+        tile, s, t = wp.tid()
+        columns = (width + TILE - 1) / TILE
+        column = t % TILE
+        row = t / TILE
+        x = (tile % columns) * TILE + column
+        y = (tile / columns) * TILE + row
+        inside = x < width and y < height
+        T = wp.where(inside, 1.0, 0.0)
+        total = Lanes(0.0)
+        last = offsets[tile + 1]
+        for start in range(offsets[tile], last, STAGE):
+            staged = wp.tile_load(fragments, shape=STAGE, offset=start, storage="shared")
+            for j in range(wp.min(STAGE, last - start)):
+                f = staged[j]
+                alpha = alpha_at(f, column, row, knobs)
+                w = contribution(alpha, T, knobs)
+                if w > 0.0:
+                    total += w * features[f.gaussian, s]
+                T = attenuated(alpha, T, knobs)
+            open_pixels = wp.tile_sum(wp.tile(wp.where(T > 0.0, 1, 0)))
+            if open_pixels[0] == 0:
+                break
+        if inside:
+            for c in range(LANES):
+                if s * LANES + c < features_out.shape[2]:
+                    features_out[y, x, s * LANES + c] = total[c]
+            if s == 0:
+                transmittance_out[y, x] = wp.abs(T)
+
+    return composite_features_block

@@ -1,0 +1,256 @@
+"""Front-to-back compositing, lane schedule (CPU): a thread owns a tile, 16 pixels of one of its rows are one vector.
+
+Every kernel walks a tile's fragments front to back and, for each, only the rows its footprint touches. The state of a
+row (transmittance, accumulated channels) lives in a small scratch that stays in the first-level cache; `slot` names
+the scratch of the host thread that runs the launch.
+"""
+
+from functools import cache
+
+import warp as wp
+
+from sgwarp.kernels.binning import TILE, Fragment
+from sgwarp.kernels.projection import Knobs
+from sgwarp.kernels.transmittance import LANE_OPTIONS, LANES, Lanes, alpha_from_level, attenuated, contribution
+
+wp.set_module_options(LANE_OPTIONS)
+
+CLOSE_EVERY = wp.constant(32)  # fragments between two looks at which rows are closed
+
+
+@wp.func
+def open_lanes(x: int, width: int) -> Lanes:
+    """Transmittance before the first Gaussian: 1 inside the image; lanes beyond its edge start closed."""
+    T = Lanes(0.0)
+    for i in range(LANES):
+        T[i] = wp.where(x + i < width, 1.0, 0.0)
+    return T
+
+
+@wp.func
+def row_is_reached(f: Fragment, row: int, knobs: Knobs) -> bool:
+    """Whether the footprint touches any of the row's 16 pixel centres."""
+    dy = float(row) - f.y
+    v = f.c * dy
+    left = f.b * dy - f.a * f.x
+    nearest = wp.max(wp.max(left, -left - float(LANES - 1) * f.a), 0.0)
+    return nearest * nearest + v * v <= f.level - knobs.alpha_min_level
+
+
+@wp.func
+def lane_alphas(f: Fragment, row: int, knobs: Knobs) -> Lanes:
+    """Opacity of the fragment at the 16 pixels of a row."""
+    dy = float(row) - f.y
+    v = f.c * dy
+    left = f.b * dy - f.a * f.x
+    top = f.level - v * v
+    alphas = Lanes(0.0)
+    for i in range(LANES):
+        u = left + f.a * float(i)
+        alphas[i] = alpha_from_level(top - u * u, knobs)
+    return alphas
+
+
+@wp.func
+def lane_contributions(alphas: Lanes, T: Lanes, knobs: Knobs) -> Lanes:
+    w = Lanes(0.0)
+    for i in range(LANES):
+        w[i] = contribution(alphas[i], T[i], knobs)
+    return w
+
+
+@wp.func
+def lane_attenuated(alphas: Lanes, T: Lanes, knobs: Knobs) -> Lanes:
+    next_T = Lanes(0.0)
+    for i in range(LANES):
+        next_T[i] = attenuated(alphas[i], T[i], knobs)
+    return next_T
+
+
+@wp.func
+def open_row_mask(y: int, height: int) -> int:
+    """Bit per row of a tile whose first row is y: set where the row lies inside the image."""
+    return (1 << wp.min(TILE, height - y)) - 1
+
+
+@wp.func
+def still_open(mask: int, state: wp.array3d[Lanes], slot: int) -> int:
+    """Clear the bits of rows whose 16 pixels are all closed."""
+    kept = mask
+    for row in range(TILE):
+        if wp.max(state[slot, row, 0]) <= 0.0:
+            kept = kept & ~(1 << row)
+    return kept
+
+
+@cache
+def make_composite_colors(depth: bool) -> wp.Kernel:
+    """Kernel that composites three packed channels; with `depth` also sum of alpha T z and the surface depth."""
+    planes = 6 if depth else 4
+
+    @wp.kernel(module="unique", module_options=LANE_OPTIONS, enable_backward=False)
+    def composite_colors(
+        # In:
+        base: int,  # first tile of this launch
+        slot: int,  # scratch of this launch
+        offsets: wp.array[int],  # [tiles + 1] first fragment of each tile
+        fragments: wp.array[Fragment],  # [I]
+        knobs: Knobs,
+        width: int,  # [pixels]
+        height: int,
+        state: wp.array3d[Lanes],  # [slots, 16, planes] scratch
+        # Out:
+        colors_out: wp.array2d[wp.vec3],  # [H, W] sum of alpha T color
+        transmittance_out: wp.array2d[float],  # [H, W]
+        depth_sum_out: wp.array2d[float],  # [H, W] sum of alpha T z [m]
+        surface_out: wp.array2d[float],  # [H, W] z where accumulated opacity passes alpha_d [m], 0 = no hit
+    ):
+        """Paper eq. 1 for one tile per thread."""
+        tile = base + wp.tid()
+        columns = (width + TILE - 1) / TILE
+        x0 = (tile % columns) * TILE
+        y0 = (tile / columns) * TILE
+        for row in range(TILE):
+            state[slot, row, 0] = open_lanes(x0, width)
+            for plane in range(1, planes):
+                state[slot, row, plane] = Lanes(0.0)
+        open_rows = open_row_mask(y0, height)
+        first = offsets[tile]
+        for k in range(first, offsets[tile + 1]):
+            f = fragments[k]
+            for row in range(f.first_row, f.last_row + 1):
+                if row_is_reached(f, row, knobs) and (open_rows >> row) & 1 != 0:
+                    T = state[slot, row, 0]
+                    alphas = lane_alphas(f, row, knobs)
+                    w = lane_contributions(alphas, T, knobs)
+                    state[slot, row, 0] = lane_attenuated(alphas, T, knobs)
+                    state[slot, row, 1] = state[slot, row, 1] + w * f.color[0]
+                    state[slot, row, 2] = state[slot, row, 2] + w * f.color[1]
+                    state[slot, row, 3] = state[slot, row, 3] + w * f.color[2]
+                    if wp.static(depth):
+                        state[slot, row, 4] = state[slot, row, 4] + w * f.depth
+                        surface = state[slot, row, 5]
+                        for i in range(LANES):
+                            behind = T[i] - alphas[i] * T[i]
+                            here = wp.where(behind <= knobs.surface_transmittance, f.depth, surface[i])
+                            surface[i] = wp.where(T[i] > knobs.surface_transmittance, here, surface[i])
+                        state[slot, row, 5] = surface
+            if (k - first) % CLOSE_EVERY == CLOSE_EVERY - 1:
+                open_rows = still_open(open_rows, state, slot)
+                if open_rows == 0:
+                    break
+        for row in range(wp.min(TILE, height - y0)):
+            T = state[slot, row, 0]
+            r = state[slot, row, 1]
+            g = state[slot, row, 2]
+            b = state[slot, row, 3]
+            for i in range(wp.min(LANES, width - x0)):
+                colors_out[y0 + row, x0 + i] = wp.vec3(r[i], g[i], b[i])
+                transmittance_out[y0 + row, x0 + i] = wp.abs(T[i])
+            if wp.static(depth):
+                z = state[slot, row, 4]
+                surface = state[slot, row, 5]
+                for i in range(wp.min(LANES, width - x0)):
+                    depth_sum_out[y0 + row, x0 + i] = z[i]
+                    surface_out[y0 + row, x0 + i] = surface[i]
+
+    return composite_colors
+
+
+BATCH = wp.constant(32)  # fragments whose weights are kept before they are multiplied by their features
+PASS = 16  # channels accumulated in registers at a time
+Accumulator = wp.types.matrix(shape=(PASS, LANES), dtype=wp.float32)
+
+
+@wp.func
+def add_products(
+    weights: wp.array3d[Lanes],
+    owners: wp.array3d[int],
+    slot: int,
+    row: int,
+    count: int,
+    features: wp.array3d[Lanes],
+    s: int,
+    state: wp.array3d[Lanes],
+    plane: int,
+):
+    """Add sum_b w_b x_b for 16 channels of a row: one register per channel, one load per weight."""
+    acc = Accumulator()
+    for c in range(PASS):
+        acc[c] = state[slot, row, plane + c]
+    for b in range(count):
+        w = weights[slot, row, b]
+        x = features[owners[slot, row, b], s, 0]
+        for c in range(PASS):
+            acc[c] = acc[c] + w * x[c]
+    for c in range(PASS):
+        state[slot, row, plane + c] = acc[c]
+
+
+@cache
+def make_composite_features(slices: int) -> wp.Kernel:
+    """Kernel that composites passes of `16 slices` channels."""
+
+    @wp.kernel(module="unique", module_options=LANE_OPTIONS, enable_backward=False)
+    def composite_features(
+        # In:
+        base: int,
+        slot: int,
+        offsets: wp.array[int],  # [tiles + 1]
+        fragments: wp.array[Fragment],  # [I]
+        features: wp.array3d[Lanes],  # [N, S, 1] channels in slices of 16
+        first_slice: int,  # of this pass
+        knobs: Knobs,
+        width: int,
+        height: int,
+        state: wp.array3d[Lanes],  # [slots, 16, 1 + 16 slices] scratch
+        weights: wp.array3d[Lanes],  # [slots, 16, BATCH] scratch
+        owners: wp.array3d[int],  # [slots, 16, BATCH] scratch
+        # Out:
+        features_out: wp.array3d[float],  # [H, W, C] sum of alpha T x
+        transmittance_out: wp.array2d[float],  # [H, W]
+    ):
+        """Paper eq. 1 for any number of channels."""
+        tile = base + wp.tid()
+        columns = (width + TILE - 1) / TILE
+        x0 = (tile % columns) * TILE
+        y0 = (tile / columns) * TILE
+        rows = wp.min(TILE, height - y0)
+        inside = wp.min(LANES, width - x0)
+        for row in range(rows):
+            state[slot, row, 0] = open_lanes(x0, width)
+            for plane in range(1, wp.static(1 + 16 * slices)):
+                state[slot, row, plane] = Lanes(0.0)
+        open_rows = open_row_mask(y0, height)
+        last = offsets[tile + 1]
+        for start in range(offsets[tile], last, BATCH):
+            stop = wp.min(start + BATCH, last)
+            for row in range(rows):
+                if (open_rows >> row) & 1 != 0:
+                    count = int(0)
+                    T = state[slot, row, 0]
+                    for k in range(start, stop):
+                        f = fragments[k]
+                        if row_is_reached(f, row, knobs):
+                            alphas = lane_alphas(f, row, knobs)
+                            weights[slot, row, count] = lane_contributions(alphas, T, knobs)
+                            owners[slot, row, count] = f.gaussian
+                            T = lane_attenuated(alphas, T, knobs)
+                            count += 1
+                    state[slot, row, 0] = T
+                    for s in range(wp.static(slices)):
+                        add_products(weights, owners, slot, row, count, features, first_slice + s, state, 1 + PASS * s)
+            open_rows = still_open(open_rows, state, slot)
+            if open_rows == 0:
+                break
+        channels = features_out.shape[2]
+        for row in range(rows):
+            T = state[slot, row, 0]
+            for i in range(inside):
+                transmittance_out[y0 + row, x0 + i] = wp.abs(T[i])
+            for c in range(wp.min(wp.static(PASS * slices), channels - PASS * first_slice)):
+                values = state[slot, row, 1 + c]
+                for i in range(inside):
+                    features_out[y0 + row, x0 + i, PASS * first_slice + c] = values[i]
+
+    return composite_features

@@ -1,0 +1,49 @@
+"""Real spherical harmonics up to degree 3, in the sign convention of 3D Gaussian Splatting files."""
+
+import warp as wp
+
+from sgwarp.kernels.gaussian import Pinhole
+
+wp.set_module_options({"enable_backward": False, "fast_math": False})
+
+
+@wp.func
+def harmonics_color(sh: wp.array2d[wp.vec3], i: int, degree: int, direction: wp.vec3) -> wp.vec3:
+    """Colour of Gaussian i seen along a unit direction: max(0, sum_k Y_k(direction) sh_k + 1/2)."""
+    x = direction[0]
+    y = direction[1]
+    z = direction[2]
+    color = 0.28209479177387814 * sh[i, 0]
+    if degree > 0:
+        color += 0.4886025119029199 * (z * sh[i, 2] - y * sh[i, 1] - x * sh[i, 3])
+    if degree > 1:
+        color += 1.0925484305920792 * (x * y * sh[i, 4] - y * z * sh[i, 5] - x * z * sh[i, 7])
+        color += 0.31539156525252005 * (3.0 * z * z - 1.0) * sh[i, 6]
+        color += 0.5462742152960396 * (x * x - y * y) * sh[i, 8]
+    if degree > 2:
+        five = 5.0 * z * z - 1.0
+        color += -0.5900435899266435 * (y * (3.0 * x * x - y * y) * sh[i, 9] + x * (x * x - 3.0 * y * y) * sh[i, 15])
+        color += 2.890611442640554 * x * y * z * sh[i, 10]
+        color += -0.4570457994644658 * five * (y * sh[i, 11] + x * sh[i, 13])
+        color += 0.3731763325901154 * z * (5.0 * z * z - 3.0) * sh[i, 12]
+        color += 1.445305721320277 * z * (x * x - y * y) * sh[i, 14]
+    color += wp.vec3(0.5, 0.5, 0.5)
+    return wp.max(color, wp.vec3(0.0, 0.0, 0.0))
+
+
+@wp.kernel
+def evaluate_harmonics(
+    # In:
+    base: int,  # first entry of `order` in this launch
+    order: wp.array[int],  # [V] visible Gaussians
+    means: wp.array[wp.vec3],  # [N] centres [m]
+    sh: wp.array2d[wp.vec3],  # [N, K] coefficients
+    degree: int,
+    camera: Pinhole,
+    # Out:
+    colors_out: wp.array[wp.vec3],  # [N] written for the visible only
+):
+    """View-dependent colour of the visible Gaussians; others are neither read nor written."""
+    i = order[base + wp.tid()]
+    away = (means[i] - camera.center) - camera.center_rest
+    colors_out[i] = harmonics_color(sh, i, degree, wp.normalize(away))

@@ -1,0 +1,178 @@
+"""Launching kernels: host threads on the CPU, torch's current stream on CUDA, and reusable scratch memory.
+
+A CPU launch of Warp is one serial loop that releases the interpreter lock. So a launch is cut into chunks, and host
+threads take chunks in turn; every kernel writes disjoint memory, so the result does not depend on their number.
+"""
+
+from __future__ import annotations
+
+import itertools
+import os
+import threading
+from collections.abc import Sequence
+from concurrent.futures import ThreadPoolExecutor
+from typing import Any
+
+import torch
+import warp as wp
+from torch import Tensor
+
+CHUNKS_PER_THREAD = 8  # enough to even out tiles of different cost
+SMALL = 256  # below this many threads of a launch, a second host thread costs more than it saves
+
+if wp.config.log_level == wp.LOG_INFO:  # Warp's default reports every module it loads
+    wp.config.log_level = wp.LOG_WARNING
+wp.init()
+
+
+def _available_cores() -> int:
+    affinity = getattr(os, "sched_getaffinity", None)
+    return len(affinity(0)) if affinity else os.cpu_count() or 1
+
+
+_thread_count = _available_cores()
+_pool: ThreadPoolExecutor | None = None
+_pool_lock = threading.Lock()
+_local = threading.local()
+
+
+def get_threads() -> int:
+    """Host threads that a CPU launch uses."""
+    return _thread_count
+
+
+def set_threads(count: int) -> None:
+    """Use `count` host threads from now on; the results do not depend on it.
+
+    Raises:
+        ValueError: `count` is not positive.
+    """
+    global _thread_count, _pool
+    if count < 1:
+        raise ValueError(f"threads: expected at least 1, got {count}")
+    with _pool_lock:
+        if count != _thread_count and _pool is not None:
+            _pool.shutdown(wait=True)
+            _pool = None
+        _thread_count = count
+
+
+def _executor() -> ThreadPoolExecutor:
+    global _pool
+    with _pool_lock:
+        if _pool is None:
+            _pool = ThreadPoolExecutor(max_workers=max(_thread_count - 1, 1), thread_name_prefix="sgwarp")
+        return _pool
+
+
+def launch(
+    kernel: wp.Kernel,
+    count: int,
+    inputs: Sequence[Any],
+    outputs: Sequence[Any],
+    *,
+    device: torch.device,
+    slots: bool = False,
+    chunk: int | None = None,
+) -> None:
+    """Run a kernel whose first argument is the first index of the launch.
+
+    Args:
+        kernel: Takes `base` (and then `slot`, if `slots`) before `inputs`.
+        count: Number of kernel threads.
+        slots: Pass the number of the host thread, which names its scratch; less than `get_threads()`.
+        chunk: Kernel threads per host launch, by default an eighth of a host thread's share.
+    """
+    if count == 0:
+        return
+    head = [0, 0] if slots else [0]
+    if device.type == "cuda":
+        stream = wp.stream_from_torch(torch.cuda.current_stream(device))
+        wp.launch(kernel, count, [*head, *inputs], outputs, stream=stream)
+        return
+    threads = 1 if chunk is None and count < SMALL else min(_thread_count, count)
+    if threads == 1:
+        wp.launch(kernel, count, [*head, *inputs], outputs, device="cpu")
+        return
+    size = chunk or max(1, -(-count // (threads * CHUNKS_PER_THREAD)))
+    ticket = itertools.count()  # next() is atomic under the interpreter lock
+
+    def work(slot: int) -> None:
+        command = None
+        while (base := next(ticket) * size) < count:
+            if command is None:
+                first = [base, slot] if slots else [base]
+                command = wp.launch(kernel, size, [*first, *inputs], outputs, device="cpu", record_cmd=True)
+            command.set_param_at_index(0, base)
+            command.set_dim(min(size, count - base))
+            command.launch()
+
+    kernel.module.load("cpu", block_dim=1)  # once, before several threads ask for it
+    helpers = [_executor().submit(work, slot) for slot in range(1, threads)]
+    try:
+        work(0)
+    finally:
+        for helper in helpers:
+            helper.result()
+
+
+def launch_blocks(
+    kernel: wp.Kernel, grid: Sequence[int], inputs: Sequence[Any], outputs: Sequence[Any], *, device: torch.device
+) -> None:
+    """Run a block-schedule kernel with 256 threads per block; on the CPU the threads are cooperative fibers."""
+    if device.type == "cuda":
+        stream = wp.stream_from_torch(torch.cuda.current_stream(device))
+        wp.launch_tiled(kernel, dim=list(grid), inputs=inputs, outputs=outputs, block_dim=256, stream=stream)
+        return
+    previous = wp.config.enable_cpu_blocks
+    wp.config.enable_cpu_blocks = True
+    try:
+        wp.launch_tiled(kernel, dim=list(grid), inputs=inputs, outputs=outputs, block_dim=256, device="cpu")
+    finally:
+        wp.config.enable_cpu_blocks = previous
+
+
+def launch_plain(
+    kernel: wp.Kernel, count: int, inputs: Sequence[Any], outputs: Sequence[Any], *, device: torch.device
+) -> None:
+    """Run a kernel that takes no `base`, in one launch."""
+    if count == 0:
+        return
+    if device.type == "cuda":
+        stream = wp.stream_from_torch(torch.cuda.current_stream(device))
+        wp.launch(kernel, count, inputs, outputs, stream=stream)
+    else:
+        wp.launch(kernel, count, inputs, outputs, device="cpu")
+
+
+def view(tensor: Tensor, dtype: Any) -> wp.array:
+    """The tensor's memory as a Warp array, without a copy; vector types take the last dimension."""
+    return wp.from_torch(tensor.detach(), dtype=dtype, requires_grad=False)
+
+
+def scratch(name: str, count: int, dtype: torch.dtype, device: torch.device) -> Tensor:
+    """A flat tensor of at least `count` elements, reused by the next call with this name from the same thread.
+
+    Fresh memory costs more than most kernels that write it: the operating system clears every page.
+    """
+    store: dict[tuple[str, torch.dtype, torch.device], Tensor] = _local.__dict__.setdefault("store", {})
+    key = (name, dtype, device)
+    held = store.get(key)
+    if held is None or held.numel() < count:
+        held = torch.empty(max(count + count // 4, 1), dtype=dtype, device=device)
+        store[key] = held
+    return held[:count]
+
+
+def scratch_structs(name: str, count: int, struct: Any, device: torch.device) -> wp.array:
+    """Scratch memory as an array of a Warp struct."""
+    size = wp.types.type_size_in_bytes(struct)
+    memory = scratch(name, count * size // 4, torch.int32, device)
+    return wp.array(
+        ptr=memory.data_ptr(), dtype=struct, shape=(count,), capacity=count * size, device=wp.device_from_torch(device)
+    )
+
+
+def release_scratch() -> None:
+    """Give the calling thread's scratch memory back."""
+    _local.__dict__.pop("store", None)

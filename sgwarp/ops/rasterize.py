@@ -1,0 +1,194 @@
+"""Rendering a view: colours or any number of feature channels, alpha and depth."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import torch
+import warp as wp
+from torch import Tensor
+
+from sgwarp.errors import InputError
+from sgwarp.kernels import compositing_block, compositing_lanes
+from sgwarp.kernels.transmittance import Lanes
+from sgwarp.ops import tiles
+from sgwarp.ops.launch import get_threads, launch, launch_blocks, scratch, view
+from sgwarp.ops.settings import RasterSettings
+from sgwarp.scene import Camera, Gaussians
+
+LANE = 16
+WIDE_PASS = 4  # slices of 16 channels that one walk over the tiles composites; more would leave the cache
+
+
+@dataclass(frozen=True, eq=False)
+class Rendering:
+    """What a camera sees.
+
+    Attributes:
+        features: sum of alpha T x plus the background, float32 [H, W, C].
+        alpha: Accumulated opacity 1 - T, float32 [H, W].
+        expected_depth: Mean z weighted by alpha T [m], 0 where nothing is, float32 [H, W]; None if not asked for.
+        depth: z of the Gaussian at which accumulated opacity passes `surface_opacity` [m], 0 = no hit, float32 [H, W];
+            None if not asked for.
+        culled: Gaussians left out, by reason.
+    """
+
+    features: Tensor
+    alpha: Tensor
+    expected_depth: Tensor | None
+    depth: Tensor | None
+    culled: dict[str, int]
+
+
+def rasterize(
+    gaussians: Gaussians,
+    camera: Camera,
+    features: Tensor | None = None,
+    *,
+    background: Tensor | None = None,
+    expected_depth: bool = False,
+    depth: bool = False,
+    settings: RasterSettings = RasterSettings(),  # noqa: B008 - frozen
+) -> Rendering:
+    """Render a view (paper eq. 1): project, order by (depth, index), list per tile, composite front to back.
+
+    Args:
+        gaussians: The scene; Gaussians that are not finite, transparent, out of range or off screen are left out.
+        camera: Where to look from.
+        features: float32 [N, C], composited in place of the spherical-harmonic colours.
+        background: float32 [C], seen through what is left transparent; None is zero.
+        expected_depth, depth: Which depths to render; without them nothing is computed for them.
+        settings: The approximations.
+
+    Raises:
+        InputError: `features` or `background` do not fit.
+    """
+    n = len(gaussians)
+    if features is not None:
+        ok = features.ndim == 2 and len(features) == n and features.shape[1] > 0 and features.is_floating_point()
+        if not ok:
+            raise InputError(f"features: expected floating point [{n}, C], got {features.dtype} {list(features.shape)}")
+    channels = 3 if features is None else features.shape[1]
+    if background is not None and tuple(background.shape) != (channels,):
+        raise InputError(f"background: expected shape [{channels}], got {list(background.shape)}")
+
+    projected = tiles.project(gaussians, camera, settings)
+    order = tiles.depth_order(projected)
+    colors = _packed_colors(gaussians, camera, features, order, settings)
+    lists = tiles.bin_splats(projected, order, colors, camera, settings)
+    wants_depth = expected_depth or depth
+    image, transmittance, depth_sum, surface = composite(lists, camera, settings, features, wants_depth)
+    if background is not None:
+        image = image + transmittance[..., None] * background.to(image)
+    alpha = 1.0 - transmittance
+    mean_depth = None
+    if expected_depth:
+        mean_depth = torch.where(alpha > 0, depth_sum / alpha.clamp(min=1e-12), 0.0)
+    return Rendering(image, alpha, mean_depth, surface if depth else None, projected.culled())
+
+
+def _packed_colors(
+    gaussians: Gaussians, camera: Camera, features: Tensor | None, order: Tensor, settings: RasterSettings
+) -> Tensor | None:
+    """Three channels travel with the fragments; more are gathered while compositing."""
+    if features is None:
+        return tiles.shade(gaussians, camera, order, settings)
+    if features.shape[1] > 3:
+        return None
+    padded = torch.zeros(len(features), 3, dtype=torch.float32, device=gaussians.device)
+    padded[:, : features.shape[1]] = features
+    return padded
+
+
+def composite(
+    lists: tiles.TileLists,
+    camera: Camera,
+    settings: RasterSettings,
+    features: Tensor | None,
+    wants_depth: bool,
+    schedule: str | None = None,
+) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+    """Composite tile lists: image [H, W, C], transmittance, depth sum and surface depth [H, W].
+
+    `schedule` is "lanes" or "block", by default the device's own; either runs on the CPU.
+    """
+    device = lists.order.device
+    block = (schedule or ("block" if device.type == "cuda" else "lanes")) == "block"
+    height, width = camera.size
+    transmittance = torch.empty(height, width, device=device)
+    wide = features is not None and features.shape[1] > 3
+    depth_shape = (height, width) if wants_depth else (0, 0)
+    depth_sum, surface = torch.empty(depth_shape, device=device), torch.empty(depth_shape, device=device)
+    image = None
+    if wide:
+        assert features is not None
+        image = _composite_wide(lists, camera, settings, features, transmittance, block)
+    if not wide or wants_depth:
+        colors = torch.empty(height, width, 3, device=device)
+        inputs = [view(lists.offsets, wp.int32), lists.fragments, tiles.knobs(settings), width, height]
+        outputs = [view(colors, wp.vec3), *(view(t, wp.float32) for t in (transmittance, depth_sum, surface))]
+        if block:
+            kernel = compositing_block.make_composite_colors_block(wants_depth)
+            launch_blocks(kernel, [lists.tile_count], inputs, outputs, device=device)
+        else:
+            kernel = compositing_lanes.make_composite_colors(wants_depth)
+            state = lane_scratch("state", TILE_ROWS, 6 if wants_depth else 4, device)
+            launch(kernel, lists.tile_count, [*inputs, state], outputs, device=device, slots=True)
+        if image is None:
+            image = colors if features is None else colors[..., : features.shape[1]]
+    return image, transmittance, depth_sum, surface
+
+
+TILE_ROWS = 16
+
+
+def lane_scratch(name: str, rows: int, planes: int, device: torch.device) -> wp.array:
+    """Scratch vectors [threads, rows, planes] of the lane schedule."""
+    shape = (get_threads(), rows, planes, LANE)
+    memory = scratch(f"lanes {name}", get_threads() * rows * planes * LANE, torch.float32, device)
+    return view(memory.view(shape), Lanes)
+
+
+def in_slices(features: Tensor) -> Tensor:
+    """Channels padded with zeros to a multiple of 16, float32 [..., S, 16]; no copy if there is nothing to do."""
+    channels = features.shape[-1]
+    padded = -(-channels // LANE) * LANE
+    features = features.detach().to(torch.float32)
+    if padded != channels:
+        features = torch.nn.functional.pad(features, (0, padded - channels))
+    return features.contiguous().unflatten(-1, (padded // LANE, LANE))
+
+
+def _composite_wide(
+    lists: tiles.TileLists,
+    camera: Camera,
+    settings: RasterSettings,
+    features: Tensor,
+    transmittance: Tensor,
+    block: bool,
+) -> Tensor:
+    device = lists.order.device
+    height, width = camera.size
+    image = torch.empty(height, width, features.shape[1], device=device)
+    slices = in_slices(features)
+    count = slices.shape[1]
+    lead = [view(lists.offsets, wp.int32), lists.fragments]
+    tail = [tiles.knobs(settings), width, height]
+    outputs = [view(image, wp.float32), view(transmittance, wp.float32)]
+    if block:
+        kernel = compositing_block.make_composite_features_block()
+        launch_blocks(kernel, [lists.tile_count, count], [*lead, view(slices, Lanes), *tail], outputs, device=device)
+        return image
+    batch = compositing_lanes.BATCH
+    weights = lane_scratch("weights", TILE_ROWS, batch, device)
+    owners = scratch("owners", get_threads() * TILE_ROWS * batch, torch.int32, device)
+    owner_array = view(owners.view(get_threads(), TILE_ROWS, batch), wp.int32)
+    first = 0
+    while first < count:
+        width_of_pass = WIDE_PASS if count - first >= WIDE_PASS else 1
+        kernel = compositing_lanes.make_composite_features(width_of_pass)
+        state = lane_scratch("state", TILE_ROWS, 1 + LANE * width_of_pass, device)
+        inputs = [*lead, view(slices.unsqueeze(2), Lanes), first, *tail, state, weights, owner_array]
+        launch(kernel, lists.tile_count, inputs, outputs, device=device, slots=True)
+        first += width_of_pass
+    return image

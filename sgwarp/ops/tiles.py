@@ -1,0 +1,215 @@
+"""Projection and tile lists of one view: what compositing and lifting both start from."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import torch
+import warp as wp
+from torch import Tensor
+
+from sgwarp.errors import InputError
+from sgwarp.kernels import binning, harmonics, projection
+from sgwarp.kernels.gaussian import Pinhole, Splat
+from sgwarp.ops.launch import launch, launch_plain, scratch, scratch_structs, view
+from sgwarp.ops.settings import RasterSettings
+from sgwarp.scene import Camera, Gaussians
+
+TILE = 16
+SLICES = 16  # of the depth order, counted and filled independently; not the number of threads
+MAX_INTERSECTIONS = 2**31 - 1
+
+
+@dataclass(frozen=True)
+class Projected:
+    """Splats of one view; the arrays are scratch, valid until the next view."""
+
+    splats: wp.array  # Splat [N]
+    status: Tensor  # uint8 [N], see kernels/projection.py
+    depths: Tensor  # float32 [N] z [m], valid where visible
+
+    def culled(self) -> dict[str, int]:
+        """How many Gaussians were left out, by reason."""
+        counts = torch.bincount(self.status.to(torch.int64), minlength=len(projection.STATUS_NAMES)).tolist()
+        return {name: counts[i] for i, name in enumerate(projection.STATUS_NAMES) if i != 0 and counts[i]}
+
+
+@dataclass(frozen=True)
+class TileLists:
+    """Fragments of one view, tile by tile, front to back; scratch, valid until the next view."""
+
+    order: Tensor  # int32 [V] Gaussians by (depth, index)
+    entries: Tensor  # int32 [V + 1] first intersection of each entry of `order`
+    offsets: Tensor  # int32 [tiles + 1] first fragment of each tile
+    fragments: wp.array  # Fragment [I]
+    places: Tensor  # int32 [I] position in the tile lists of each intersection, by Gaussian
+    tiles: Tensor  # int32 [I] tile of each intersection, by Gaussian
+
+    @property
+    def intersections(self) -> int:
+        return len(self.places)
+
+    @property
+    def tile_count(self) -> int:
+        return len(self.offsets) - 1
+
+
+def pinhole(camera: Camera) -> Pinhole:
+    """The camera as the kernels read it."""
+    fx, fy, cx, cy = (camera.K[i, j].item() for i, j in ((0, 0), (1, 1), (0, 2), (1, 2)))
+    center = camera.position
+    rounded = center.to(torch.float32)
+    device = Pinhole()
+    device.rotation = wp.mat33(*camera.world_to_camera[:3, :3].flatten().tolist())
+    device.center = wp.vec3(*rounded.tolist())
+    device.center_rest = wp.vec3(*(center - rounded.to(torch.float64)).tolist())
+    device.focal = wp.vec2(fx, fy)
+    device.principal = wp.vec2(cx, cy)
+    # gsplat's clamp: 0.3 half fields of view beyond the image's borders, wherever the principal point lies.
+    margin_x, margin_y = 0.15 * camera.width / fx, 0.15 * camera.height / fy
+    device.tangent_min = wp.vec2(-cx / fx - margin_x, -cy / fy - margin_y)
+    device.tangent_max = wp.vec2((camera.width - cx) / fx + margin_x, (camera.height - cy) / fy + margin_y)
+    device.width, device.height = camera.width, camera.height
+    device.near, device.far = camera.near, camera.far
+    return device
+
+
+def knobs(settings: RasterSettings) -> projection.Knobs:
+    """The settings as the kernels read them."""
+    device = projection.Knobs()
+    device.alpha_min = settings.alpha_min
+    device.alpha_max = settings.alpha_max
+    device.transmittance_min = settings.transmittance_min
+    device.dilation = settings.dilation
+    device.antialiased = int(settings.antialiased)
+    device.surface_transmittance = 1.0 - settings.surface_opacity
+    device.alpha_min_level = math.log2(settings.alpha_min)
+    return device
+
+
+def project(gaussians: Gaussians, camera: Camera, settings: RasterSettings) -> Projected:
+    """Project every Gaussian; one kernel thread each."""
+    n, device = len(gaussians), gaussians.device
+    splats = scratch_structs("splats", n, Splat, device)
+    status = scratch("status", n, torch.uint8, device)
+    depths = scratch("depths", n, torch.float32, device)
+    inputs = [
+        view(gaussians.means, wp.vec3),
+        view(gaussians.quats, wp.vec4),
+        view(gaussians.scales, wp.vec3),
+        view(gaussians.opacities, wp.float32),
+        pinhole(camera),
+        knobs(settings),
+    ]
+    outputs = [splats, view(status, wp.uint8), view(depths, wp.float32)]
+    launch(projection.project_gaussians, n, inputs, outputs, device=device)
+    return Projected(splats, status, depths)
+
+
+def depth_order(projected: Projected) -> Tensor:
+    """Visible Gaussians by (depth, index), int32 [V]; on CUDA all N, the culled last, so that nobody waits for V."""
+    device = projected.status.device
+    if device.type == "cuda":
+        shown = torch.where(projected.status == projection.VISIBLE, projected.depths, math.inf)
+        return shown.argsort(stable=True).to(torch.int32)
+    visible = (projected.status == projection.VISIBLE).nonzero().flatten().to(torch.int32)
+    count = len(visible)
+    keys = scratch("depth keys", 2 * count, torch.float32, device)
+    order = scratch("order", 2 * count, torch.int32, device)
+    torch.index_select(projected.depths, 0, visible, out=keys[:count])
+    order[:count] = visible
+    if count:
+        wp.utils.radix_sort_pairs(view(keys, wp.float32), view(order, wp.int32), count)
+    return order[:count]
+
+
+def shade(gaussians: Gaussians, camera: Camera, order: Tensor, settings: RasterSettings) -> Tensor:
+    """Colours of the visible Gaussians seen from the camera, float32 [N, 3]; other rows are left as they are."""
+    degree = gaussians.sh_degree if settings.sh_degree is None else min(settings.sh_degree, gaussians.sh_degree)
+    colors = scratch("colors", 3 * len(gaussians), torch.float32, gaussians.device).view(-1, 3)
+    inputs = [
+        view(order, wp.int32),
+        view(gaussians.means, wp.vec3),
+        view(gaussians.sh, wp.vec3),
+        degree,
+        pinhole(camera),
+    ]
+    launch(harmonics.evaluate_harmonics, len(order), inputs, [view(colors, wp.vec3)], device=gaussians.device)
+    return colors
+
+
+def _first_places(counts: Tensor) -> Tensor:
+    """Exclusive prefix sum with the total at the end, int32 [n + 1]."""
+    places = torch.zeros(len(counts) + 1, dtype=torch.int64, device=counts.device)
+    torch.cumsum(counts, 0, out=places[1:])
+    total = int(places[-1])  # the one host synchronisation of the render path on CUDA: it sizes the lists
+    if total > MAX_INTERSECTIONS:
+        raise InputError(f"{total} tile intersections exceed 2^31 - 1; render at a lower resolution or fewer Gaussians")
+    return places.to(torch.int32)
+
+
+def bin_splats(
+    projected: Projected, order: Tensor, colors: Tensor | None, camera: Camera, settings: RasterSettings
+) -> TileLists:
+    """Write the tile lists of a view; `colors` [N, 3] travel with the fragments."""
+    device = order.device
+    columns, rows = -(-camera.width // TILE), -(-camera.height // TILE)
+    level = math.log2(settings.alpha_min)
+    packed = view(colors, wp.vec3) if colors is not None else wp.empty(0, dtype=wp.vec3, device=str(device))
+    make = _bin_by_sorting if device.type == "cuda" else _bin_by_counting
+    return make(projected, order, packed, columns * rows, camera.width, camera.height, level)
+
+
+def _list_memory(total: int, device: torch.device) -> tuple[wp.array, Tensor, Tensor]:
+    fragments = scratch_structs("fragments", total, binning.Fragment, device)
+    places = scratch("places", total, torch.int32, device)
+    return fragments, places, scratch("tiles", total, torch.int32, device)
+
+
+def _bin_by_counting(
+    projected: Projected, order: Tensor, colors: wp.array, tiles: int, width: int, height: int, level: float
+) -> TileLists:
+    device, count = order.device, len(order)
+    per_slice = max(1, -(-count // SLICES))
+    tile_counts = scratch("tile counts", SLICES * tiles, torch.int32, device).view(SLICES, tiles).zero_()
+    splat_counts = scratch("splat counts", count, torch.int32, device)
+    shared = [view(order, wp.int32), projected.splats]
+    sizes = [per_slice, width, height, level]
+    outputs = [view(tile_counts, wp.int32), view(splat_counts, wp.int32)]
+    launch(binning.count_tiles, SLICES, [*shared, *sizes], outputs, device=device, chunk=1)
+    entries = _first_places(splat_counts)
+    # Tile by tile, and within a tile slice by slice, so that each slice continues where the one in front ended.
+    by_tile = tile_counts.t().reshape(-1).cumsum(0, dtype=torch.int32) - tile_counts.t().reshape(-1)
+    cursors = by_tile.view(tiles, SLICES).t().contiguous()
+    offsets = torch.cat([cursors[0], entries[-1:]])
+    fragments, places, owners = _list_memory(int(entries[-1]), device)
+    inputs = [*shared, colors, *sizes, view(entries, wp.int32)]
+    outputs = [view(cursors, wp.int32), fragments, view(places, wp.int32), view(owners, wp.int32)]
+    launch(binning.fill_tiles, SLICES, inputs, outputs, device=device, chunk=1)
+    return TileLists(order, entries, offsets, fragments, places, owners)
+
+
+def _bin_by_sorting(
+    projected: Projected, order: Tensor, colors: wp.array, tiles: int, width: int, height: int, level: float
+) -> TileLists:
+    device, count = order.device, len(order)
+    splat_counts = scratch("splat counts", count, torch.int32, device)
+    shared = [view(order, wp.int32), projected.splats, view(projected.status, wp.uint8), width, height, level]
+    launch_plain(binning.count_splat_tiles, count, shared, [view(splat_counts, wp.int32)], device=device)
+    entries = _first_places(splat_counts)
+    total = int(entries[-1])
+    fragments, places, owners = _list_memory(total, device)
+    keys = scratch("tile keys", 2 * total, torch.int32, device)
+    values = scratch("tile values", 2 * total, torch.int32, device)
+    gaussians = scratch("tile gaussians", total, torch.int32, device)
+    outputs = [view(t, wp.int32) for t in (owners, values, gaussians)]
+    launch_plain(binning.emit_tiles, count, [*shared, view(entries, wp.int32)], outputs, device=device)
+    keys[:total] = owners
+    if total:
+        wp.utils.radix_sort_pairs(view(keys, wp.int32), view(values, wp.int32), total, end_bit=tiles.bit_length())
+    edges = torch.arange(tiles + 1, dtype=torch.int32, device=device)
+    offsets = torch.searchsorted(keys[:total], edges).to(torch.int32)
+    inputs = [*(view(t, wp.int32) for t in (keys, values, gaussians)), projected.splats, colors, width]
+    launch_plain(binning.pack_fragments, total, inputs, [fragments, view(places, wp.int32)], device=device)
+    return TileLists(order, entries, offsets, fragments, places, owners)
