@@ -11,7 +11,16 @@ import warp as wp
 
 from sgwarp.kernels.binning import TILE, Fragment
 from sgwarp.kernels.projection import Knobs
-from sgwarp.kernels.transmittance import LANE_OPTIONS, LANES, Lanes, alpha_from_level, attenuated, contribution
+from sgwarp.kernels.transmittance import (
+    HALF_ROW,
+    LANE_OFFSETS,
+    LANE_OPTIONS,
+    LANES,
+    Lanes,
+    alpha_from_level,
+    attenuated,
+    contribution,
+)
 
 wp.set_module_options(LANE_OPTIONS)
 
@@ -32,8 +41,8 @@ def row_is_reached(f: Fragment, row: int, knobs: Knobs) -> bool:
     """Whether the footprint touches any of the row's 16 pixel centres."""
     dy = float(row) - f.y
     v = f.c * dy
-    left = f.b * dy - f.a * f.x
-    nearest = wp.max(wp.max(left, -left - float(LANES - 1) * f.a), 0.0)
+    middle = f.b * dy + f.a * (HALF_ROW - f.x)
+    nearest = wp.max(wp.abs(middle) - HALF_ROW * f.a, 0.0)
     return nearest * nearest + v * v <= f.level - knobs.alpha_min_level
 
 
@@ -42,11 +51,12 @@ def lane_alphas(f: Fragment, row: int, knobs: Knobs) -> Lanes:
     """Opacity of the fragment at the 16 pixels of a row."""
     dy = float(row) - f.y
     v = f.c * dy
-    left = f.b * dy - f.a * f.x
+    middle = f.b * dy + f.a * (HALF_ROW - f.x)
     top = f.level - v * v
+    ramp = f.a * LANE_OFFSETS
     alphas = Lanes(0.0)
     for i in range(LANES):
-        u = left + f.a * float(i)
+        u = middle + ramp[i]
         alphas[i] = alpha_from_level(top - u * u, knobs)
     return alphas
 

@@ -9,7 +9,13 @@ u^2 + v^2 with u = a dx + b dy, v = c dy (Cholesky), so needles lose no digits t
 
 import warp as wp
 
-wp.set_module_options({"enable_backward": False, "fast_math": False})
+# Exact about NaN and infinity, which projection looks for.
+EXACT_OPTIONS = {
+    "enable_backward": False,
+    "fast_math": False,
+    "cpu_compiler_flags": "-march=native -ffp-contract=fast -mllvm=-inline-threshold=9000",
+}
+wp.set_module_options(EXACT_OPTIONS)
 
 LOG2_E = wp.constant(1.4426950408889634)
 MIN_QUAT_NORM2 = wp.constant(1.0e-6)  # |q|^2 below this has no direction
@@ -43,7 +49,8 @@ class Splat:
     c: float
     level: float  # log2 of the opacity
     depth: float  # z in the camera frame [m]
-    half_height: float  # of the footprint {alpha >= alpha_min} [pixels]
+    half_width: float  # of the footprint {alpha >= alpha_min} [pixels]
+    half_height: float
 
 
 @wp.func
@@ -109,7 +116,13 @@ def footprint(splat: Splat, alpha_min_level: float) -> float:
 
 
 @wp.func
-def column_range(splat: Splat, q: float, y_first: float, y_last: float):
+def footprint_summit(splat: Splat, q: float) -> float:
+    """dy at which the right border of the footprint is furthest right [pixels]."""
+    return -splat.b * wp.sqrt(q / (splat.b * splat.b + splat.c * splat.c)) / splat.c
+
+
+@wp.func
+def column_range(splat: Splat, q: float, summit: float, y_first: float, y_last: float):
     """Exact range of x [pixels] that the footprint covers between two heights; empty if first > second.
 
     The right border x(y) = (-b y + sqrt(q - c^2 y^2)) / a is concave, so its largest value over a band lies at the
@@ -117,14 +130,13 @@ def column_range(splat: Splat, q: float, y_first: float, y_last: float):
     """
     lo = wp.max(y_first - splat.mean[1], -splat.half_height)
     hi = wp.min(y_last - splat.mean[1], splat.half_height)
-    summit = -splat.b * wp.sqrt(q / (splat.b * splat.b + splat.c * splat.c)) / splat.c
     y_right = wp.clamp(summit, lo, hi)
     y_left = wp.clamp(-summit, lo, hi)
     cr = splat.c * y_right
     cl = splat.c * y_left
-    right = (wp.sqrt(wp.max(q - cr * cr, 0.0)) - splat.b * y_right) / splat.a
-    left = (-wp.sqrt(wp.max(q - cl * cl, 0.0)) - splat.b * y_left) / splat.a
-    if lo > hi:
-        right = -1.0e30
-        left = 1.0e30
+    inv_a = 1.0 / splat.a
+    right = (wp.sqrt(wp.max(q - cr * cr, 0.0)) - splat.b * y_right) * inv_a
+    left = (-wp.sqrt(wp.max(q - cl * cl, 0.0)) - splat.b * y_left) * inv_a
+    right = wp.where(lo > hi, -1.0e30, right)
+    left = wp.where(lo > hi, 1.0e30, left)
     return splat.mean[0] + left, splat.mean[0] + right

@@ -2,9 +2,9 @@
 
 import warp as wp
 
-from sgwarp.kernels.gaussian import Pinhole
+from sgwarp.kernels.gaussian import EXACT_OPTIONS, Pinhole
 
-wp.set_module_options({"enable_backward": False, "fast_math": False})
+wp.set_module_options(EXACT_OPTIONS)
 
 
 @wp.func
@@ -41,9 +41,10 @@ def evaluate_harmonics(
     degree: int,
     camera: Pinhole,
     # Out:
-    colors_out: wp.array[wp.vec3],  # [N] written for the visible only
+    colors_out: wp.array[wp.vec3],  # [V]
 ):
-    """View-dependent colour of the visible Gaussians; others are neither read nor written."""
-    i = order[base + wp.tid()]
+    """View-dependent colour of the visible Gaussians, in depth order; others are not read."""
+    k = base + wp.tid()
+    i = order[k]
     away = (means[i] - camera.center) - camera.center_rest
-    colors_out[i] = harmonics_color(sh, i, degree, wp.normalize(away))
+    colors_out[k] = harmonics_color(sh, i, degree, wp.normalize(away))

@@ -3,6 +3,7 @@
 import warp as wp
 
 from sgwarp.kernels.gaussian import (
+    EXACT_OPTIONS,
     LEVEL_SLACK,
     LOG2_E,
     MIN_QUAT_NORM2,
@@ -13,7 +14,7 @@ from sgwarp.kernels.gaussian import (
     projected_factor,
 )
 
-wp.set_module_options({"enable_backward": False, "fast_math": False})
+wp.set_module_options(EXACT_OPTIONS)
 
 # Why a Gaussian is left out; `status_out` holds one of these.
 VISIBLE = wp.constant(0)
@@ -112,11 +113,11 @@ def project_gaussians(
     splat.depth = point[2]
     q = splat.level - knobs.alpha_min_level + LEVEL_SLACK
     reach = wp.sqrt(q) / unit
-    half_width = reach * wp.sqrt(xx)
+    splat.half_width = reach * wp.sqrt(xx)
     splat.half_height = reach * wp.sqrt(yy)
     x = splat.mean[0]
     y = splat.mean[1]
-    inside = x + half_width >= 0.5 and x - half_width <= float(camera.width) - 0.5
+    inside = x + splat.half_width >= 0.5 and x - splat.half_width <= float(camera.width) - 0.5
     inside = inside and y + splat.half_height >= 0.5 and y - splat.half_height <= float(camera.height) - 0.5
     if not inside:
         status_out[i] = wp.uint8(OFF_SCREEN)

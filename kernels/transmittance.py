@@ -7,11 +7,14 @@ from sgwarp.kernels.projection import Knobs
 # One vector register of the lane schedule holds 16 pixels of a row (AVX-512; narrower machines use two or four).
 LANES = 16
 Lanes = wp.types.vector(length=LANES, dtype=wp.float32)
+HALF_ROW = wp.constant(0.5 * float(LANES - 1))
+# Lane positions from the middle of the row: none is 0 or 1, so the compiler cannot take products apart lane by lane.
+LANE_OFFSETS = wp.constant(Lanes(*[i - 0.5 * (LANES - 1) for i in range(LANES)]))
 LaneIds = wp.types.vector(length=LANES, dtype=wp.int32)
 
 # Only for modules behind the non-finite cull: -ffast-math assumes that there is no NaN and no infinity.
 LANE_FLAGS = (
-    "-march=native -ffast-math -mprefer-vector-width=512 -mllvm=-inline-threshold=9000 -Wno-nan-infinity-disabled"
+    "-march=native -ffast-math -ffp-contract=fast -mprefer-vector-width=512 -mllvm=-inline-threshold=9000 -Wno-nan-infinity-disabled"
 )
 LANE_OPTIONS = {"enable_backward": False, "fast_math": True, "cpu_compiler_flags": LANE_FLAGS}
 BLOCK_OPTIONS = {"enable_backward": False, "fast_math": False}

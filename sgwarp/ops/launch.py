@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import itertools
 import os
+import sys
 import threading
 from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
@@ -20,9 +21,28 @@ from torch import Tensor
 CHUNKS_PER_THREAD = 8  # enough to even out tiles of different cost
 SMALL = 256  # below this many threads of a launch, a second host thread costs more than it saves
 
-if wp.config.log_level == wp.LOG_INFO:  # Warp's default reports every module it loads
-    wp.config.log_level = wp.LOG_WARNING
-wp.init()
+
+def _init_warp() -> None:
+    """Start Warp without its banner, and on a machine without a GPU without the warning that there is none."""
+    if wp.config.log_level == wp.LOG_INFO:
+        wp.config.log_level = wp.LOG_WARNING
+    if torch.cuda.is_available():
+        wp.init()
+        return
+    # The native library writes that warning straight to file descriptor 2, past every setting.
+    sys.stderr.flush()
+    kept = os.dup(2)
+    sink = os.open(os.devnull, os.O_WRONLY)
+    try:
+        os.dup2(sink, 2)
+        wp.init()
+    finally:
+        os.dup2(kept, 2)
+        os.close(kept)
+        os.close(sink)
+
+
+_init_warp()
 
 
 def _available_cores() -> int:

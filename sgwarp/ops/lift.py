@@ -91,7 +91,7 @@ def lift_view(
         raise InputError(f"feature map: {got}, but the sums hold {sums.channels} for {len(sums.weight)}")
     projected = tiles.project(gaussians, camera, settings)
     order = tiles.depth_order(projected)
-    lists = tiles.bin_splats(projected, order, None, camera, settings)
+    lists = tiles.bin_splats(projected, order, None, camera, settings, places=feature_map.ids is not None)
     if mode == "center":
         _add_centers(projected, lists, camera, feature_map, sums, tau, border, settings)
         return

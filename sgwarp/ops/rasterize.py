@@ -90,13 +90,13 @@ def rasterize(
 def _packed_colors(
     gaussians: Gaussians, camera: Camera, features: Tensor | None, order: Tensor, settings: RasterSettings
 ) -> Tensor | None:
-    """Three channels travel with the fragments; more are gathered while compositing."""
+    """Colours by depth order. Three channels travel with the fragments; more are gathered while compositing."""
     if features is None:
         return tiles.shade(gaussians, camera, order, settings)
     if features.shape[1] > 3:
         return None
-    padded = torch.zeros(len(features), 3, dtype=torch.float32, device=gaussians.device)
-    padded[:, : features.shape[1]] = features
+    padded = torch.zeros(len(order), 3, dtype=torch.float32, device=gaussians.device)
+    padded[:, : features.shape[1]] = features[order.to(torch.int64)]
     return padded
 
 

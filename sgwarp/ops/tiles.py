@@ -43,12 +43,9 @@ class TileLists:
     entries: Tensor  # int32 [V + 1] first intersection of each entry of `order`
     offsets: Tensor  # int32 [tiles + 1] first fragment of each tile
     fragments: wp.array  # Fragment [I]
-    places: Tensor  # int32 [I] position in the tile lists of each intersection, by Gaussian
-    tiles: Tensor  # int32 [I] tile of each intersection, by Gaussian
-
-    @property
-    def intersections(self) -> int:
-        return len(self.places)
+    intersections: int  # I
+    places: Tensor  # int32 [I] position in the tile lists of each intersection, by Gaussian; empty unless asked for
+    tiles: Tensor  # int32 [I] tile of each intersection, by Gaussian; empty unless asked for
 
     @property
     def tile_count(self) -> int:
@@ -125,9 +122,9 @@ def depth_order(projected: Projected) -> Tensor:
 
 
 def shade(gaussians: Gaussians, camera: Camera, order: Tensor, settings: RasterSettings) -> Tensor:
-    """Colours of the visible Gaussians seen from the camera, float32 [N, 3]; other rows are left as they are."""
+    """Colours of the visible Gaussians seen from the camera, in depth order, float32 [V, 3]."""
     degree = gaussians.sh_degree if settings.sh_degree is None else min(settings.sh_degree, gaussians.sh_degree)
-    colors = scratch("colors", 3 * len(gaussians), torch.float32, gaussians.device).view(-1, 3)
+    colors = scratch("colors", 3 * len(order), torch.float32, gaussians.device).view(-1, 3)
     inputs = [
         view(order, wp.int32),
         view(gaussians.means, wp.vec3),
@@ -150,66 +147,76 @@ def _first_places(counts: Tensor) -> Tensor:
 
 
 def bin_splats(
-    projected: Projected, order: Tensor, colors: Tensor | None, camera: Camera, settings: RasterSettings
+    projected: Projected,
+    order: Tensor,
+    colors: Tensor | None,
+    camera: Camera,
+    settings: RasterSettings,
+    *,
+    places: bool = False,
 ) -> TileLists:
-    """Write the tile lists of a view; `colors` [N, 3] travel with the fragments."""
+    """Write the tile lists of a view; `colors` [V, 3] travel with the fragments, `places` only if asked for."""
     device = order.device
     columns, rows = -(-camera.width // TILE), -(-camera.height // TILE)
     level = math.log2(settings.alpha_min)
     packed = view(colors, wp.vec3) if colors is not None else wp.empty(0, dtype=wp.vec3, device=str(device))
-    make = _bin_by_sorting if device.type == "cuda" else _bin_by_counting
-    return make(projected, order, packed, columns * rows, camera.width, camera.height, level)
+    ordered = scratch_structs("ordered splats", len(order), Splat, device)
+    launch(binning.gather_splats, len(order), [view(order, wp.int32), projected.splats], [ordered], device=device)
+    grid = (columns * rows, camera.width, camera.height)
+    if device.type == "cuda":
+        return bin_by_sorting(ordered, projected.status, order, packed, grid, level)
+    return bin_by_counting(ordered, order, packed, grid, level, places)
 
 
-def _list_memory(total: int, device: torch.device) -> tuple[wp.array, Tensor, Tensor]:
-    fragments = scratch_structs("fragments", total, binning.Fragment, device)
-    places = scratch("places", total, torch.int32, device)
-    return fragments, places, scratch("tiles", total, torch.int32, device)
-
-
-def _bin_by_counting(
-    projected: Projected, order: Tensor, colors: wp.array, tiles: int, width: int, height: int, level: float
+def bin_by_counting(
+    splats: wp.array, order: Tensor, colors: wp.array, grid: tuple[int, int, int], level: float, with_places: bool
 ) -> TileLists:
+    """Count and fill in slices of the depth order (CPU); `grid` is tiles, width, height."""
+    tiles, width, height = grid
     device, count = order.device, len(order)
     per_slice = max(1, -(-count // SLICES))
     tile_counts = scratch("tile counts", SLICES * tiles, torch.int32, device).view(SLICES, tiles).zero_()
     splat_counts = scratch("splat counts", count, torch.int32, device)
-    shared = [view(order, wp.int32), projected.splats]
     sizes = [per_slice, width, height, level]
     outputs = [view(tile_counts, wp.int32), view(splat_counts, wp.int32)]
-    launch(binning.count_tiles, SLICES, [*shared, *sizes], outputs, device=device, chunk=1)
+    launch(binning.count_tiles, SLICES, [splats, *sizes], outputs, device=device, chunk=1)
     entries = _first_places(splat_counts)
     # Tile by tile, and within a tile slice by slice, so that each slice continues where the one in front ended.
-    by_tile = tile_counts.t().reshape(-1).cumsum(0, dtype=torch.int32) - tile_counts.t().reshape(-1)
-    cursors = by_tile.view(tiles, SLICES).t().contiguous()
+    by_tile = tile_counts.t().reshape(-1)
+    cursors = (by_tile.cumsum(0, dtype=torch.int32) - by_tile).view(tiles, SLICES).t().contiguous()
     offsets = torch.cat([cursors[0], entries[-1:]])
-    fragments, places, owners = _list_memory(int(entries[-1]), device)
-    inputs = [*shared, colors, *sizes, view(entries, wp.int32)]
+    total = int(entries[-1])
+    fragments = scratch_structs("fragments", total, binning.Fragment, device)
+    places, owners = (scratch(name, total if with_places else 0, torch.int32, device) for name in ("places", "tiles"))
+    inputs = [view(order, wp.int32), splats, colors, *sizes, view(entries, wp.int32)]
     outputs = [view(cursors, wp.int32), fragments, view(places, wp.int32), view(owners, wp.int32)]
     launch(binning.fill_tiles, SLICES, inputs, outputs, device=device, chunk=1)
-    return TileLists(order, entries, offsets, fragments, places, owners)
+    return TileLists(order, entries, offsets, fragments, total, places, owners)
 
 
-def _bin_by_sorting(
-    projected: Projected, order: Tensor, colors: wp.array, tiles: int, width: int, height: int, level: float
+def bin_by_sorting(
+    splats: wp.array, status: Tensor, order: Tensor, colors: wp.array, grid: tuple[int, int, int], level: float
 ) -> TileLists:
+    """Emit in depth order, sort by tile, pack (CUDA); the lists are those of `bin_by_counting`."""
+    tiles, width, height = grid
     device, count = order.device, len(order)
     splat_counts = scratch("splat counts", count, torch.int32, device)
-    shared = [view(order, wp.int32), projected.splats, view(projected.status, wp.uint8), width, height, level]
+    shared = [view(order, wp.int32), splats, view(status, wp.uint8), width, height, level]
     launch_plain(binning.count_splat_tiles, count, shared, [view(splat_counts, wp.int32)], device=device)
     entries = _first_places(splat_counts)
     total = int(entries[-1])
-    fragments, places, owners = _list_memory(total, device)
+    fragments = scratch_structs("fragments", total, binning.Fragment, device)
+    places, owners = (scratch(name, total, torch.int32, device) for name in ("places", "tiles"))
     keys = scratch("tile keys", 2 * total, torch.int32, device)
     values = scratch("tile values", 2 * total, torch.int32, device)
-    gaussians = scratch("tile gaussians", total, torch.int32, device)
-    outputs = [view(t, wp.int32) for t in (owners, values, gaussians)]
+    ranks = scratch("tile ranks", total, torch.int32, device)
+    outputs = [view(t, wp.int32) for t in (owners, values, ranks)]
     launch_plain(binning.emit_tiles, count, [*shared, view(entries, wp.int32)], outputs, device=device)
     keys[:total] = owners
     if total:
         wp.utils.radix_sort_pairs(view(keys, wp.int32), view(values, wp.int32), total, end_bit=tiles.bit_length())
     edges = torch.arange(tiles + 1, dtype=torch.int32, device=device)
     offsets = torch.searchsorted(keys[:total], edges).to(torch.int32)
-    inputs = [*(view(t, wp.int32) for t in (keys, values, gaussians)), projected.splats, colors, width]
+    inputs = [*(view(t, wp.int32) for t in (keys, values, ranks, order)), splats, colors, width]
     launch_plain(binning.pack_fragments, total, inputs, [fragments, view(places, wp.int32)], device=device)
-    return TileLists(order, entries, offsets, fragments, places, owners)
+    return TileLists(order, entries, offsets, fragments, total, places, owners)
