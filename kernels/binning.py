@@ -1,9 +1,9 @@
 """Tile lists: which splats touch which 16 x 16 tile, front to back.
 
 Gaussians are sorted once by (depth, index); a stable counting pass then writes every tile's list in that order, so
-the intersections themselves are never sorted. On the CPU the counting pass runs in slices of the depth order: each slice counts
-its own tiles, prefix sums turn the counts into disjoint places, and each slice fills them. Any number of threads
-writes the same lists.
+the intersections themselves are never sorted. On the CPU the counting pass runs in slices of the depth order: each
+slice counts its own tiles, prefix sums turn the counts into disjoint places, and each slice fills them. Any number of
+threads writes the same lists.
 
 On CUDA one thread per Gaussian emits its (tile, intersection) pairs in depth order; a stable radix sort by tile alone
 then gives the same lists, and one thread per place packs the fragment.
@@ -114,7 +114,7 @@ def count_tiles(
         q = footprint(splat, alpha_min_level)
         summit = footprint_summit(splat, q)
         box_first, box_last = box_columns(splat, width)
-        total = int(0)
+        total = 0
         first_row, last_row = tile_rows(splat, height)
         for row in range(first_row, last_row + 1):
             first, last = row_columns(splat, q, summit, row, width, box_first, box_last)
@@ -208,7 +208,7 @@ def count_splat_tiles(
 ):
     """Count intersections per Gaussian (CUDA)."""
     k = wp.tid()
-    total = int(0)
+    total = 0
     if int(status[order[k]]) == VISIBLE:
         splat = splats[k]
         q = footprint(splat, alpha_min_level)

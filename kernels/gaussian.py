@@ -92,9 +92,7 @@ def ewa_rows(camera: Pinhole, point: wp.vec3):
 
 
 @wp.func
-def projected_factor(
-    camera: Pinhole, point: wp.vec3, quat: wp.vec4, scale: wp.vec3
-):
+def projected_factor(camera: Pinhole, point: wp.vec3, quat: wp.vec4, scale: wp.vec3):
     """Rows of M = J W R S [pixels]; the projected covariance is M M^T."""
     row_x, row_y = ewa_rows(camera, point)
     axes = camera.rotation * rotation_from_quaternion(quat)

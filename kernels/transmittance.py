@@ -14,7 +14,8 @@ LaneIds = wp.types.vector(length=LANES, dtype=wp.int32)
 
 # Only for modules behind the non-finite cull: -ffast-math assumes that there is no NaN and no infinity.
 LANE_FLAGS = (
-    "-march=native -ffast-math -ffp-contract=fast -mprefer-vector-width=512 -mllvm=-inline-threshold=9000 -Wno-nan-infinity-disabled"
+    "-march=native -ffast-math -ffp-contract=fast -mprefer-vector-width=512"
+    " -mllvm=-inline-threshold=9000 -Wno-nan-infinity-disabled"
 )
 LANE_OPTIONS = {"enable_backward": False, "fast_math": True, "cpu_compiler_flags": LANE_FLAGS}
 BLOCK_OPTIONS = {"enable_backward": False, "fast_math": False}

@@ -5,9 +5,14 @@ In a wheel the kernels lie in `sgwarp/kernels/`, in a checkout in `kernels/` bes
 """
 
 from pathlib import Path
+from typing import TYPE_CHECKING, Any
 
 _here = Path(__file__).resolve().parent
 _candidates = (_here / "kernels", _here.parent / "kernels")
 __path__ = [str(folder) for folder in _candidates if (folder / "gaussian.py").is_file()][:1]
 if not __path__:
     raise ImportError(f"sgwarp: the kernel sources are missing; looked in {', '.join(map(str, _candidates))}")
+
+if TYPE_CHECKING:  # a type checker cannot follow __path__
+
+    def __getattr__(name: str) -> Any: ...

@@ -39,7 +39,7 @@ def _float32(name: str, value: Any, shape: tuple[int | None, ...]) -> Tensor:
 
 def _first_bad(name: str, bad: Tensor, rule: str, values: Tensor) -> None:
     """Raise naming the first row where `bad` is set."""
-    rows = bad.reshape(len(bad), -1).any(dim=1)
+    rows = bad.flatten(1).any(dim=1) if bad.ndim > 1 else bad  # reshape(0, -1) is ambiguous
     if bool(rows.any()):
         index = int(rows.nonzero()[0])
         raise InputError(f"{name}[{index}] = {values[index].tolist()}: {rule} ({int(rows.sum())} such rows)")
@@ -170,7 +170,7 @@ class Camera:
         _require(error < 1e-3, f"world_to_camera: not a rigid transform (R Rt differs from I by {error:.2g})")
         _require(bool(torch.linalg.det(R) > 0), "world_to_camera: mirrors the world (determinant -1)")
         affine = torch.tensor([0.0, 0.0, 0.0, 1.0], dtype=torch.float64)
-        _require(bool((pose[3] == affine).all()), f"world_to_camera: last row must be [0, 0, 0, 1], got {pose[3].tolist()}")
+        _require(bool((pose[3] == affine).all()), "world_to_camera: last row must be [0, 0, 0, 1]")
         _require(self.width > 0 and self.height > 0, f"image size must be positive, got {self.width} x {self.height}")
         _require(0 < self.near < self.far, f"near: expected 0 < near < far, got {self.near} and {self.far}")
         put(self, "K", K)
@@ -262,7 +262,8 @@ class FeatureMap:
             put(self, "dense", dense)
             if self.valid is not None:
                 valid = torch.as_tensor(self.valid, dtype=torch.bool)
-                _require(valid.shape == dense.shape[:2], f"valid: expected {list(dense.shape[:2])}, got {list(valid.shape)}")
+                fits = valid.shape == dense.shape[:2]
+                _require(fits, f"valid: expected {list(dense.shape[:2])}, got {list(valid.shape)}")
                 put(self, "valid", valid)
             return
         ids = torch.as_tensor(self.ids)
@@ -321,7 +322,8 @@ class Semantics:
         put(self, "effective_views", _float32("effective_views", self.effective_views, (n,)))
         _require(bool(self.space), "space: must name the embedding space")
         if self.labels is not None:
-            _require(len(self.labels) == features.shape[1], f"labels: expected {features.shape[1]}, got {len(self.labels)}")
+            named, channels = len(self.labels), features.shape[1]
+            _require(named == channels, f"labels: expected {channels}, got {named}")
 
     def __len__(self) -> int:
         return len(self.features)

@@ -165,7 +165,7 @@ def launch_plain(
         wp.launch(kernel, count, inputs, outputs, device="cpu")
 
 
-def view(tensor: Tensor, dtype: Any) -> wp.array:
+def view(tensor: Tensor, dtype: Any) -> Any:
     """The tensor's memory as a Warp array, without a copy; vector types take the last dimension."""
     return wp.from_torch(tensor.detach(), dtype=dtype, requires_grad=False)
 
@@ -184,7 +184,7 @@ def scratch(name: str, count: int, dtype: torch.dtype, device: torch.device) -> 
     return held[:count]
 
 
-def scratch_structs(name: str, count: int, struct: Any, device: torch.device) -> wp.array:
+def scratch_structs(name: str, count: int, struct: Any, device: torch.device) -> Any:
     """Scratch memory as an array of a Warp struct."""
     size = wp.types.type_size_in_bytes(struct)
     memory = scratch(name, count * size // 4, torch.int32, device)

@@ -346,5 +346,5 @@ def _read_at(feature_map: FeatureMap, camera: Camera, y: Tensor, x: Tensor) -> t
     else:
         vectors = feature_map.vectors.to(y.device)
     # Several levels count once: the mean over the levels that carry an id here.
-    features = torch.stack([torch.where(h[:, None], vectors[i.clamp(min=0)], 0.0) for i, h in zip(ids, held)]).sum(0)
+    features = torch.where(held[..., None], vectors[ids.clamp(min=0)], 0.0).sum(0)
     return features / held.sum(0).clamp(min=1)[:, None], held.any(dim=0)

@@ -136,6 +136,7 @@ def composite(
             launch(kernel, lists.tile_count, [*inputs, state], outputs, device=device, slots=True)
         if image is None:
             image = colors if features is None else colors[..., : features.shape[1]]
+    assert image is not None
     return image, transmittance, depth_sum, surface
 
 

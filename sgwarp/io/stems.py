@@ -1,0 +1,43 @@
+"""Names of views: label images and feature files are matched to photographs by them."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Sequence
+from pathlib import PurePosixPath
+
+from sgwarp.errors import InputError
+
+IMAGE_SUFFIXES = (".png", ".jpg", ".jpeg", ".PNG", ".JPG", ".JPEG")
+
+
+def unique_stems(source: str | os.PathLike[str], names: Sequence[str]) -> list[str]:
+    """One stem per listed photograph: its file name without extension.
+
+    Where two photographs share it (a/0.png and b/0.png), all of them are named by their whole relative path instead,
+    joined by underscores (a_0, b_0).
+
+    Args:
+        source: The file that lists them, for the message.
+        names: Relative paths, with or without extension.
+
+    Raises:
+        InputError: Two photographs have the same name even so.
+    """
+    paths = [_without_extension(name) for name in names]
+    stems = [path.name for path in paths]
+    if len(set(stems)) < len(stems):
+        stems = ["_".join(part for part in path.parts if part not in ("..", "/")) for path in paths]
+    first: dict[str, int] = {}
+    for index, stem in enumerate(stems):
+        if stem in first:
+            raise InputError(
+                f"{source}: {names[first[stem]]!r} and {names[index]!r} are both view {stem!r}; rename or drop one"
+            )
+        first[stem] = index
+    return stems
+
+
+def _without_extension(name: str) -> PurePosixPath:
+    path = PurePosixPath(name.replace("\\", "/"))
+    return path.with_suffix("") if path.suffix in IMAGE_SUFFIXES else path

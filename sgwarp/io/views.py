@@ -1,0 +1,43 @@
+"""Posed photographs in whatever format a folder holds."""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+
+from sgwarp.errors import InputError
+from sgwarp.io.colmap import find_model, read_colmap
+from sgwarp.io.transforms import read_transforms
+from sgwarp.scene import View
+
+TRANSFORMS = ("transforms.json", "transforms_train.json")
+
+
+def load_views(path: str | os.PathLike[str], image_folder: str | None = None, photographs: bool = True) -> list[View]:
+    """Read posed photographs: transforms.json in the order of its frames, COLMAP sorted by name.
+
+    Args:
+        path: A transforms.json, a folder that holds one, or a COLMAP data set or model. Of a folder with both,
+            transforms.json is read.
+        image_folder: COLMAP: name of the folder of photographs, `images` by default; images_4 and the like scale the
+            cameras.
+        photographs: False to take the cameras alone; views are then rendered from the scene where an image is needed.
+
+    Raises:
+        InputError: Nothing is found there, or what is found cannot be used.
+    """
+    path = Path(path)
+    if not path.exists():
+        raise InputError(f"{path}: no such file or folder; check the path")
+    files = [path] if path.is_file() else [path / name for name in TRANSFORMS]
+    transforms = next((file for file in files if file.is_file()), None)
+    if transforms is not None:
+        if image_folder is not None:
+            raise InputError(f"{transforms}: lists its photographs by path; image_folder is for COLMAP models only")
+        return read_transforms(transforms, photographs)
+    if find_model(path) is None:
+        raise InputError(
+            f"{path}: holds no views; looked for {', '.join(TRANSFORMS)} and for a COLMAP model (cameras.bin or "
+            "cameras.txt) in sparse/0, sparse, colmap/sparse/0 and the folder itself"
+        )
+    return read_colmap(path, image_folder or "images", photographs)

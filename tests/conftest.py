@@ -1,0 +1,50 @@
+"""Fixtures shared by all tests: the catalogue of scenes.
+
+`scene` runs a test once per named scene; `make_scene("name")` builds one; both are in tests/scenes.py. That file is
+loaded by its path, because importlib mode puts no folder of tests on sys.path.
+"""
+
+import importlib.util
+import sys
+from collections.abc import Callable
+from pathlib import Path
+from typing import NamedTuple
+
+import pytest
+
+from sgwarp.scene import Camera, Gaussians
+
+
+def _load(name: str, path: Path):
+    spec = importlib.util.spec_from_file_location(name, path)
+    module = importlib.util.module_from_spec(spec)
+    sys.modules[name] = module
+    spec.loader.exec_module(module)
+    return module
+
+
+catalogue = _load("sgwarp_test_scenes", Path(__file__).with_name("scenes.py"))
+
+
+class NamedScene(NamedTuple):
+    name: str
+    gaussians: Gaussians
+    camera: Camera
+
+
+@pytest.fixture(params=list(catalogue.SCENES))
+def scene(request: pytest.FixtureRequest) -> NamedScene:
+    """Every scene of the catalogue in turn: name, gaussians, camera."""
+    return NamedScene(request.param, *catalogue.SCENES[request.param]())
+
+
+@pytest.fixture(scope="session")
+def make_scene() -> Callable[[str], NamedScene]:
+    """Build one scene of the catalogue by name."""
+    return lambda name: NamedScene(name, *catalogue.SCENES[name]())
+
+
+@pytest.fixture(scope="session")
+def scenes():
+    """The module tests/scenes.py itself, for its builders (cloud, pinhole, look_at, changed)."""
+    return catalogue

@@ -1,0 +1,330 @@
+import logging
+import math
+import random
+import struct
+
+import numpy as np
+import pytest
+import torch
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from sgwarp.errors import InputError
+from sgwarp.io.ply import read_elements, read_ply, write_ply
+from sgwarp.io.scenes import load_gaussians, save_gaussians
+from sgwarp.scene import Gaussians
+
+CORE = ["x", "y", "z", "f_dc_0", "f_dc_1", "f_dc_2", "opacity"]
+CORE += ["scale_0", "scale_1", "scale_2", "rot_0", "rot_1", "rot_2", "rot_3"]
+REST = {0: 0, 1: 9, 2: 24, 3: 45}
+
+
+def names_of(degree):
+    return CORE + [f"f_rest_{i}" for i in range(REST[degree])]
+
+
+def raw_rows(names, count=5, seed=0):
+    """Random raw values, exactly representable as float32, one dict per row."""
+    rng = random.Random(seed)
+    return [{n: struct.unpack("f", struct.pack("f", rng.uniform(-3, 3)))[0] for n in names} for _ in range(count)]
+
+
+def scene_file(ply_bytes, path, rows, names=None, kinds=None, form="binary_little_endian", newline="\n"):
+    names = names or list(rows[0])
+    kinds = kinds or ["float"] * len(names)
+    table = [[row[n] for n in names] for row in rows]
+    path.write_bytes(ply_bytes([("vertex", list(zip(kinds, names, strict=True)), table)], form, newline))
+    return path
+
+
+def assert_scene(gaussians, rows, degree):
+    """Compare with the definition of each column, row by row in Python floats."""
+    assert len(gaussians) == len(rows)
+    assert gaussians.sh.shape == (len(rows), (degree + 1) ** 2, 3)
+    per_channel = (degree + 1) ** 2 - 1
+    for i, row in enumerate(rows):
+        assert gaussians.means[i].tolist() == [row[n] for n in "xyz"]
+        assert gaussians.quats[i].tolist() == [row[f"rot_{k}"] for k in range(4)]
+        scales = [math.exp(row[f"scale_{k}"]) for k in range(3)]
+        assert gaussians.scales[i].tolist() == pytest.approx(scales, rel=1e-6)
+        assert gaussians.opacities[i].item() == pytest.approx(1 / (1 + math.exp(-row["opacity"])), rel=1e-6)
+        for c in range(3):
+            assert gaussians.sh[i, 0, c].item() == row[f"f_dc_{c}"]
+            for k in range(per_channel):
+                assert gaussians.sh[i, 1 + k, c].item() == row[f"f_rest_{c * per_channel + k}"]
+
+
+def some_gaussians(count=40, coefficients=16, seed=0):
+    gen = torch.Generator().manual_seed(seed)
+    return Gaussians(
+        means=torch.randn(count, 3, generator=gen) * 10,
+        quats=torch.randn(count, 4, generator=gen),
+        scales=torch.rand(count, 3, generator=gen) + 1e-4,
+        opacities=torch.rand(count, generator=gen),
+        sh=torch.randn(count, coefficients, 3, generator=gen),
+    )
+
+
+@pytest.mark.parametrize("degree", [0, 1, 2, 3])
+@pytest.mark.parametrize("form", ["binary_little_endian", "binary_big_endian", "ascii"])
+def test_reads_every_degree_and_form(tmp_path, ply_bytes, degree, form):
+    rows = raw_rows(names_of(degree))
+    assert_scene(read_ply(scene_file(ply_bytes, tmp_path / "a.ply", rows, form=form)), rows, degree)
+
+
+def test_header_lines_may_end_in_crlf(tmp_path, ply_bytes):
+    rows = raw_rows(CORE)
+    assert_scene(read_ply(scene_file(ply_bytes, tmp_path / "a.ply", rows, newline="\r\n")), rows, 0)
+
+
+@settings(deadline=None, max_examples=40)
+@given(data=st.data(), degree=st.sampled_from([0, 1, 2, 3]), count=st.integers(1, 6))
+def test_any_order_type_and_extra_columns(tmp_path_factory, ply_bytes, data, degree, count):
+    extra = data.draw(st.lists(st.sampled_from(["nx", "segment", "uncertainty", "f_extra_0", "scale"]), unique=True))
+    names = data.draw(st.permutations(names_of(degree) + extra))
+    rows = raw_rows(names, count, seed=data.draw(st.integers(0, 99)))
+    kinds = [data.draw(st.sampled_from(["float", "double"])) for _ in names]
+    form = data.draw(st.sampled_from(["binary_little_endian", "binary_big_endian", "ascii"]))
+    path = scene_file(ply_bytes, tmp_path_factory.getbasetemp() / "any.ply", rows, names, kinds, form)
+    assert_scene(read_ply(path), rows, degree)
+
+
+def test_integer_columns_are_numbers(tmp_path, ply_bytes):
+    rows = [{**row, "f_dc_0": 200, "rot_0": -3, "x": 70000} for row in raw_rows(CORE, 3)]
+    kinds = [{"f_dc_0": "uchar", "rot_0": "short", "x": "uint"}.get(n, "float") for n in CORE]
+    assert_scene(read_ply(scene_file(ply_bytes, tmp_path / "a.ply", rows, CORE, kinds)), rows, 0)
+
+
+def test_extra_columns_are_named_and_left_out(tmp_path, ply_bytes, caplog):
+    rows = raw_rows([*CORE, "nx", "ny", "nz", "object_id"])
+    with caplog.at_level(logging.WARNING, logger="sgwarp"):
+        read_ply(scene_file(ply_bytes, tmp_path / "a.ply", rows))
+    assert [record.getMessage() for record in caplog.records] == [f"{tmp_path / 'a.ply'}: columns left out: object_id"]
+
+
+def test_other_elements_are_ignored(tmp_path, ply_bytes):
+    rows = raw_rows(CORE)
+    table = [[row[n] for n in CORE] for row in rows]
+    elements = [("camera", [("float", "fx")], [[1.0]]), ("vertex", [("float", n) for n in CORE], table)]
+    (tmp_path / "a.ply").write_bytes(ply_bytes(elements))
+    assert_scene(read_ply(tmp_path / "a.ply"), rows, 0)
+
+
+@pytest.mark.parametrize("coefficients", [1, 4, 9, 16])
+def test_round_trip(tmp_path, coefficients):
+    before = some_gaussians(coefficients=coefficients)
+    write_ply(before, tmp_path / "a.ply")
+    after = read_ply(tmp_path / "a.ply")
+    for name in ("means", "quats", "sh"):
+        assert torch.equal(getattr(after, name), getattr(before, name))
+    for name in ("scales", "opacities"):
+        torch.testing.assert_close(getattr(after, name), getattr(before, name), rtol=1e-6, atol=0)
+
+
+def test_round_trip_of_extremes(tmp_path):
+    opacities = torch.tensor([0.0, 1.0, 1e-7, 1 - 2**-24, 0.5, 1e-12])
+    scales = torch.tensor([0.0, 1e-7, 1e4, 1.0, 1e-30, 1e10])[:, None].repeat(1, 3)
+    before = some_gaussians(6)
+    before = Gaussians(before.means * 1e5, torch.zeros(6, 4), scales, opacities, before.sh)
+    write_ply(before, tmp_path / "a.ply")
+    after = read_ply(tmp_path / "a.ply")
+    assert torch.equal(after.opacities[:2], opacities[:2])
+    torch.testing.assert_close(after.opacities, opacities, rtol=2e-6, atol=0)
+    assert after.scales[0].tolist() == [0, 0, 0]
+    torch.testing.assert_close(after.scales, scales, rtol=4e-6, atol=0)
+    assert torch.equal(after.quats, before.quats)
+    logits = read_elements(tmp_path / "a.ply")["vertex"]["opacity"]
+    assert np.isfinite(logits).all()
+
+
+def test_written_columns_are_those_of_the_reference(tmp_path):
+    write_ply(some_gaussians(3, 4), tmp_path / "a.ply")
+    header = (tmp_path / "a.ply").read_bytes().split(b"end_header\n")[0].decode().splitlines()
+    names = "x y z nx ny nz f_dc_0 f_dc_1 f_dc_2 f_rest_0 f_rest_1 f_rest_2 f_rest_3 f_rest_4 f_rest_5 f_rest_6 "
+    names += "f_rest_7 f_rest_8 opacity scale_0 scale_1 scale_2 rot_0 rot_1 rot_2 rot_3"
+    assert header[:2] == ["ply", "format binary_little_endian 1.0"]
+    assert [line for line in header if line.startswith("property")] == [f"property float {n}" for n in names.split()]
+    body = (tmp_path / "a.ply").read_bytes().split(b"end_header\n", 1)[1]
+    assert len(body) == 3 * 4 * len(names.split())
+    g = some_gaussians(3, 4)
+    row = struct.unpack_from("<26f", body, 26 * 4)  # the second Gaussian
+    assert row[:3] == tuple(g.means[1].tolist())
+    assert row[9:18] == tuple(g.sh[1, 1:].T.flatten().tolist())
+    assert row[18] == pytest.approx(math.log(g.opacities[1] / (1 - g.opacities[1])), rel=1e-5)
+
+
+def test_rows_beyond_one_block(tmp_path):
+    before = some_gaussians(40_000, 1)
+    write_ply(before, tmp_path / "a.ply")
+    assert torch.equal(read_ply(tmp_path / "a.ply").means, before.means)
+
+
+def test_non_finite_rows_are_kept_and_counted(tmp_path, ply_bytes, caplog):
+    rows = raw_rows(CORE, 6)
+    rows[1]["x"], rows[3]["scale_1"], rows[4]["opacity"] = math.nan, math.inf, math.nan
+    with caplog.at_level(logging.WARNING, logger="sgwarp"):
+        gaussians = read_ply(scene_file(ply_bytes, tmp_path / "a.ply", rows))
+    assert len(gaussians) == 6
+    assert gaussians.finite.tolist() == [True, False, True, False, False, True]
+    assert "3 of 6 Gaussians hold NaN or infinity" in caplog.text
+    write_ply(gaussians, tmp_path / "b.ply")
+    assert read_ply(tmp_path / "b.ply").finite.tolist() == gaussians.finite.tolist()
+
+
+def test_logits_beyond_exp_are_opaque_or_clear(tmp_path, ply_bytes):
+    rows = raw_rows(CORE, 2)
+    rows[0]["opacity"], rows[1]["opacity"] = 1e30, -1e30
+    assert read_ply(scene_file(ply_bytes, tmp_path / "a.ply", rows)).opacities.tolist() == [1.0, 0.0]
+
+
+def test_double_beyond_float_is_non_finite(tmp_path, ply_bytes):
+    rows = [{**row, "x": 1e300} for row in raw_rows(CORE, 2)]
+    path = scene_file(ply_bytes, tmp_path / "a.ply", rows, CORE, ["double"] * len(CORE))
+    assert read_ply(path).non_finite == 2
+
+
+@pytest.mark.parametrize("form", ["binary_little_endian", "binary_big_endian"])
+def test_cut_short_at_every_place(tmp_path, ply_bytes, form):
+    path = scene_file(ply_bytes, tmp_path / "a.ply", raw_rows(CORE, 4), form=form)
+    data = path.read_bytes()
+    body = data.index(b"end_header\n") + len(b"end_header\n")
+    for length in (body, body + 1, body + 14 * 4, len(data) - 5, len(data) - 1):
+        path.write_bytes(data[:length])
+        rows = (length - body) // (14 * 4)
+        expected = (
+            rf"a\.ply: is cut short: .*'vertex' should hold 4 rows \(224 bytes.*ends after {rows} rows \({length} "
+        )
+        with pytest.raises(InputError, match=expected):
+            load_gaussians(path)
+    for length in (0, 3, 4, 30, body // 2, body - 1):
+        path.write_bytes(data[:length])
+        with pytest.raises(InputError, match=r"a\.ply: is not a valid PLY file"):
+            load_gaussians(path)
+
+
+def test_ascii_cut_short_and_malformed(tmp_path, ply_bytes):
+    path = scene_file(ply_bytes, tmp_path / "a.ply", raw_rows(CORE, 3), form="ascii")
+    text = path.read_text()
+    path.write_text(text[: text.rstrip().rindex("\n")])
+    with pytest.raises(InputError, match=r"should hold 3 rows.*ends after 2 rows"):
+        load_gaussians(path)
+    path.write_text(text.rstrip() + " 1.0\n")
+    with pytest.raises(InputError, match=r"row 2: expected end-of-line; the file is damaged"):
+        load_gaussians(path)
+    path.write_text(text.replace("end_header\n", "end_header\nspam "))
+    with pytest.raises(InputError, match=r"row 0: property 'x': malformed input"):
+        load_gaussians(path)
+
+
+def test_missing_columns_are_named(tmp_path, ply_bytes):
+    names = [n for n in CORE if n not in ("opacity", "rot_2")]
+    with pytest.raises(InputError, match=r"a\.ply: lacks the columns opacity, rot_2 of a 3DGS scene"):
+        load_gaussians(scene_file(ply_bytes, tmp_path / "a.ply", raw_rows(names)))
+
+
+def test_point_cloud_is_told_apart(tmp_path, ply_bytes):
+    path = scene_file(ply_bytes, tmp_path / "a.ply", raw_rows(["x", "y", "z", "red"]))
+    with pytest.raises(InputError, match=r"a\.ply: is a point cloud or mesh, not a 3DGS scene: no columns f_dc_0"):
+        load_gaussians(path)
+
+
+@pytest.mark.parametrize("count", [1, 3, 8, 10, 44, 48])
+def test_wrong_number_of_coefficients(tmp_path, ply_bytes, count):
+    path = scene_file(ply_bytes, tmp_path / "a.ply", raw_rows(CORE + [f"f_rest_{i}" for i in range(count)]))
+    with pytest.raises(InputError, match=rf"a\.ply: has {count} columns f_rest_\*"):
+        load_gaussians(path)
+
+
+def test_gap_in_the_coefficients(tmp_path, ply_bytes):
+    path = scene_file(ply_bytes, tmp_path / "a.ply", raw_rows(CORE + [f"f_rest_{i}" for i in range(1, 10)]))
+    with pytest.raises(InputError, match=r"has 9 columns f_rest_\*, expected none, or f_rest_0"):
+        load_gaussians(path)
+
+
+def test_empty_scene(tmp_path, ply_bytes):
+    path = tmp_path / "a.ply"
+    for form in ("binary_little_endian", "ascii"):
+        path.write_bytes(ply_bytes([("vertex", [("float", n) for n in CORE], [])], form))
+        with pytest.raises(InputError, match=r"a\.ply: has no Gaussians"):
+            load_gaussians(path)
+    with pytest.raises(InputError, match="no Gaussians"):
+        save_gaussians(some_gaussians(0), tmp_path / "b.ply")
+    assert not (tmp_path / "b.ply").exists()
+
+
+def test_list_column(tmp_path, ply_bytes):
+    path = scene_file(ply_bytes, tmp_path / "a.ply", raw_rows(CORE, 1))
+    header, body = path.read_bytes().split(b"property float x\n")
+    values = body.split(b"end_header\n")[1]
+    lists = header + b"property list uchar float x\n" + body.split(b"end_header\n")[0] + b"end_header\n"
+    path.write_bytes(lists + b"\x01" + values)
+    with pytest.raises(InputError, match=r"a\.ply: column x holds lists"):
+        load_gaussians(path)
+
+
+def test_no_vertex_element(tmp_path, ply_bytes):
+    (tmp_path / "a.ply").write_bytes(ply_bytes([("points", [("float", "x")], [[1.0]])]))
+    with pytest.raises(InputError, match=r"a\.ply: has no element 'vertex' \(it has: points\)"):
+        load_gaussians(tmp_path / "a.ply")
+
+
+def test_missing_file_folder_and_foreign(tmp_path):
+    with pytest.raises(InputError, match=r"none\.ply: no such file"):
+        load_gaussians(tmp_path / "none.ply")
+    with pytest.raises(InputError, match="is a folder"):
+        load_gaussians(tmp_path)
+    (tmp_path / "a.ply").write_bytes(b"glTF\x02\0\0\0")
+    with pytest.raises(InputError, match=r"a\.ply: is not a valid PLY file"):
+        load_gaussians(tmp_path / "a.ply")
+
+
+@pytest.mark.parametrize(
+    "damage",
+    [
+        ("element vertex 5", "element vertex -5"),
+        ("element vertex 5", "element vertex 99999999999999999999"),
+        ("element vertex 5", "element vertex many"),
+        ("property float x", "property complex x"),
+        ("property float x", "property float y"),
+        ("format binary_little_endian 1.0", "format binary_little_endian 2.0"),
+        ("end_header", "end_header and more"),
+    ],
+)
+def test_damaged_header(tmp_path, ply_bytes, damage):
+    path = scene_file(ply_bytes, tmp_path / "a.ply", raw_rows(CORE))
+    path.write_bytes(path.read_bytes().replace(damage[0].encode(), damage[1].encode(), 1))
+    with pytest.raises(InputError, match=r"a\.ply: is (not a valid PLY file|cut short)"):
+        load_gaussians(path)
+
+
+def test_name_chooses_the_format(tmp_path):
+    before = some_gaussians(10, 1)
+    save_gaussians(before, tmp_path / "a.PLY")
+    assert torch.equal(load_gaussians(tmp_path / "a.PLY").means, before.means)
+    save_gaussians(before, tmp_path / "deep" / "a.compressed.ply")
+    assert b"element chunk 1\n" in (tmp_path / "deep" / "a.compressed.ply").read_bytes()
+    with pytest.raises(InputError, match=r"a\.splat: scenes are written as \.ply"):
+        save_gaussians(before, tmp_path / "a.splat")
+
+
+@settings(deadline=None, max_examples=150)
+@given(body=st.binary(max_size=700), degree=st.sampled_from([0, 1]), ascii_form=st.booleans())
+def test_random_bytes_after_the_header(tmp_path_factory, ply_bytes, allow_input_error, body, degree, ascii_form):
+    form = "ascii" if ascii_form else "binary_little_endian"
+    names = names_of(degree)
+    header = ply_bytes([("vertex", [("float", n) for n in names], [[0.0] * len(names)] * 3)], form)
+    path = tmp_path_factory.getbasetemp() / "random.ply"
+    path.write_bytes(header[: header.index(b"end_header\n") + 11] + body)
+    with allow_input_error(path):
+        assert len(load_gaussians(path)) == 3
+
+
+@settings(deadline=None, max_examples=150)
+@given(position=st.integers(0, 10_000), value=st.binary(min_size=1, max_size=3))
+def test_damaged_anywhere(tmp_path_factory, ply_bytes, allow_input_error, position, value):
+    path = tmp_path_factory.getbasetemp() / "damaged.ply"
+    data = scene_file(ply_bytes, path, raw_rows(CORE, 2)).read_bytes()
+    position %= len(data)
+    path.write_bytes(data[:position] + value + data[position + len(value) :])
+    with allow_input_error(path):
+        load_gaussians(path)

@@ -1,0 +1,93 @@
+"""Every kernel that CUDA runs compiles to PTX without a GPU; with ptxas at hand, none of them spills registers."""
+
+import importlib
+import pkgutil
+import re
+import shutil
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+import warp as wp
+
+import sgwarp.kernels
+from sgwarp.kernels import compositing_block, lifting_block
+from sgwarp.ops import launch  # noqa: F401 - starts Warp quietly
+
+ARCHITECTURES = (80, 86, 89, 90)
+
+
+def cuda_kernels() -> list[wp.Kernel]:
+    """All kernels defined in kernels/ but the lane schedule's, which only the CPU runs, and one of each factory."""
+    kernels = []
+    for info in pkgutil.iter_modules(sgwarp.kernels.__path__):
+        if not info.name.endswith("_lanes"):
+            module = importlib.import_module(f"sgwarp.kernels.{info.name}")
+            kernels += [
+                k for k in vars(module).values() if isinstance(k, wp.Kernel) and k.module.name == module.__name__
+            ]
+    for flag in (False, True):
+        kernels.append(compositing_block.make_composite_colors_block(flag))
+        kernels.append(lifting_block.make_lift_dense_block(flag))
+        kernels.append(lifting_block.make_lift_ids_block(flag))
+    kernels.append(compositing_block.make_composite_features_block())
+    return kernels
+
+
+def test_the_list_of_kernels_is_complete():
+    names = {kernel.key.split("__locals__")[-1] for kernel in cuda_kernels()}
+    assert {"project_gaussians", "evaluate_harmonics", "pack_fragments", "sum_rows", "find_center_pixels"} <= names
+    factories = {"composite_colors_block", "composite_features_block", "lift_dense_block", "lift_ids_block"}
+    assert factories <= names
+
+
+@pytest.fixture(scope="module")
+def ptx(tmp_path_factory) -> dict[int, list[Path]]:
+    folder = tmp_path_factory.mktemp("ptx")
+    modules = {kernel.module.name: kernel.module for kernel in cuda_kernels()}
+    for arch in ARCHITECTURES:
+        for module in modules.values():
+            wp.compile_aot_module(module, device=None, arch=arch, module_dir=folder / str(arch), use_ptx=True)
+    return {arch: sorted((folder / str(arch)).glob("*.ptx")) for arch in ARCHITECTURES}
+
+
+def test_every_kernel_compiles_for_every_architecture(ptx):
+    modules = {kernel.module.name for kernel in cuda_kernels()}
+    for arch in ARCHITECTURES:
+        assert len(ptx[arch]) == len(modules)
+        for file in ptx[arch]:
+            text = file.read_text(errors="ignore")
+            assert f".target sm_{arch}" in text
+            assert ".entry" in text
+
+
+def find_ptxas() -> str | None:
+    for root in map(Path, sys.path):
+        for candidate in root.glob("nvidia/*/bin/ptxas"):
+            return str(candidate)
+    return shutil.which("ptxas")
+
+
+def test_no_kernel_spills_registers(ptx, tmp_path, record_property):
+    ptxas = find_ptxas()
+    if ptxas is None:
+        pytest.skip("no ptxas; pip install 'sgwarp[ptx]' brings one")
+    seen = 0
+    for arch in ARCHITECTURES:
+        for file in ptx[arch]:
+            clean = tmp_path / file.name
+            clean.write_bytes(file.read_bytes().rstrip(b"\0"))  # ptxas takes the closing NUL for a broken file
+            command = [ptxas, "-v", f"-arch=sm_{arch}", str(clean), "-o", str(tmp_path / "out.cubin")]
+            done = subprocess.run(command, capture_output=True, text=True)
+            if "Unsupported .version" in done.stderr:
+                pytest.skip(f"{ptxas} is older than the PTX that Warp writes")
+            assert done.returncode == 0, done.stderr
+            pattern = (
+                r"entry function '(\w+)'.*?(\d+) bytes spill stores, (\d+) bytes spill loads.*?Used (\d+) registers"
+            )
+            for name, stores, loads, registers in re.findall(pattern, done.stderr, flags=re.DOTALL):
+                seen += 1
+                record_property(f"sm_{arch} {name}", f"{registers} registers")
+                assert (stores, loads) == ("0", "0"), f"{name} spills on sm_{arch}"
+    assert seen >= len(ARCHITECTURES) * len({k.key + str(k.module.name) for k in cuda_kernels()})
