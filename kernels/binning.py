@@ -114,7 +114,7 @@ def count_tiles(
         q = footprint(splat, alpha_min_level)
         summit = footprint_summit(splat, q)
         box_first, box_last = box_columns(splat, width)
-        total = 0
+        total = int(0)
         first_row, last_row = tile_rows(splat, height)
         for row in range(first_row, last_row + 1):
             first, last = row_columns(splat, q, summit, row, width, box_first, box_last)
@@ -208,7 +208,7 @@ def count_splat_tiles(
 ):
     """Count intersections per Gaussian (CUDA)."""
     k = wp.tid()
-    total = 0
+    total = int(0)
     if int(status[order[k]]) == VISIBLE:
         splat = splats[k]
         q = footprint(splat, alpha_min_level)

@@ -56,8 +56,8 @@ def make_composite_colors_block(depth: bool) -> wp.Kernel:
         inside = x < width and y < height
         T = wp.where(inside, 1.0, 0.0)
         color = wp.vec3(0.0, 0.0, 0.0)
-        depth_sum = 0.0
-        surface = 0.0
+        depth_sum = float(0.0)
+        surface = float(0.0)
         last = offsets[tile + 1]
         for start in range(offsets[tile], last, STAGE):
             staged = wp.tile_load(fragments, shape=STAGE, offset=start, storage="shared")
@@ -69,7 +69,7 @@ def make_composite_colors_block(depth: bool) -> wp.Kernel:
                 if wp.static(depth):
                     depth_sum += w * f.depth
                     behind = T - alpha * T
-                    if knobs.surface_transmittance < T and behind <= knobs.surface_transmittance:
+                    if T > knobs.surface_transmittance and behind <= knobs.surface_transmittance:
                         surface = f.depth
                 T = attenuated(alpha, T, knobs)
             open_pixels = wp.tile_sum(wp.tile(wp.where(T > 0.0, 1, 0)))

@@ -237,7 +237,7 @@ def make_composite_features(slices: int) -> wp.Kernel:
             stop = wp.min(start + BATCH, last)
             for row in range(rows):
                 if (open_rows >> row) & 1 != 0:
-                    count = 0
+                    count = int(0)
                     T = state[slot, row, 0]
                     for k in range(start, stop):
                         f = fragments[k]

@@ -31,14 +31,14 @@ def localize_ids(
     columns = (width + TILE - 1) / TILE
     x0 = (tile % columns) * TILE
     y0 = (tile / columns) * TILE
-    count = 0
+    count = int(0)
     for row in range(TILE):
         places = LaneIds(-1)
         y = y0 + row
-        shared = -1
+        shared = int(-1)
         for i in range(TILE):
             x = x0 + i
-            place = -1
+            place = int(-1)
             if x < width and y < height:
                 # The centre of image pixel (x, y) lies in map pixel floor((x + 1/2) w / W), exactly in integers.
                 value = ids[(2 * y + 1) * ids.shape[0] / (2 * height), (2 * x + 1) * ids.shape[1] / (2 * width)]
@@ -96,7 +96,7 @@ def sum_weights(
     """Total weight of each Gaussian in one view."""
     k = base + wp.tid()
     i = order[k]
-    total = 0.0
+    total = float(0.0)
     for e in range(entries[k], entries[k + 1]):
         total += weights[e]
     weight_out[i] += total
@@ -126,7 +126,7 @@ def sum_id_weights(
     k = base + wp.tid()
     i = order[k]
     target = wp.where(by_gaussian != 0, i, k)
-    total = 0.0
+    total = float(0.0)
     for e in range(entries[k], entries[k + 1]):
         tile = tiles[e]
         ids = tile_id_counts[tile]

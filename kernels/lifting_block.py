@@ -49,7 +49,7 @@ def make_lift_dense_block(ordered: bool) -> wp.Kernel:
         y = (tile / columns) * TILE + row
         inside = x < width and y < height
         T = wp.where(inside, 1.0, 0.0)
-        seen = 0.0
+        seen = float(0.0)
         values = Lanes(0.0)
         if inside:
             seen = valid[y, x]
@@ -72,8 +72,8 @@ def make_lift_dense_block(ordered: bool) -> wp.Kernel:
                     T = attenuated(alpha, T, knobs)
             wp.tile_assign(shares, wp.tile(weights), offset=(0, 0))
             if j < count:
-                total = 0.0
-                weight = 0.0
+                total = float(0.0)
+                weight = float(0.0)
                 for step in range(BLOCK):
                     p = (step + c) % BLOCK  # start apart, so that 16 channels read 16 banks
                     total += shares[j, p] * pixels[c, p]
@@ -143,7 +143,7 @@ def make_lift_ids_block(ordered: bool) -> wp.Kernel:
             if j < count:
                 f = fragments[start + j]
                 for m in range(c, ids, LANES):
-                    total = 0.0
+                    total = float(0.0)
                     for step in range(BLOCK):
                         p = (step + c) % BLOCK
                         if owners[p] == m:

@@ -31,7 +31,7 @@ FEW_IDS = wp.constant(4)  # up to here a masked sum per id beats adding pixel by
 
 @wp.func
 def lane_sum(values: Lanes) -> float:
-    total = 0.0
+    total = float(0.0)
     for i in range(LANES):
         total += values[i]
     return total
@@ -40,7 +40,7 @@ def lane_sum(values: Lanes) -> float:
 @wp.func
 def lane_sum_of(values: Lanes, ids: LaneIds, wanted: int) -> float:
     """Sum over the lanes whose id is `wanted`."""
-    total = 0.0
+    total = float(0.0)
     for i in range(LANES):
         total += wp.where(ids[i] == wanted, values[i], 0.0)
     return total
@@ -156,7 +156,7 @@ def lift_ids(
     for k in range(first, offsets[tile + 1]):
         f = fragments[k]
         place = row_starts[tile] + (k - first) * ids
-        run = -1  # id shared by the rows summed in `total` so far
+        run = int(-1)  # id shared by the rows summed in `total` so far
         total = Lanes(0.0)
         for row in range(f.first_row, f.last_row + 1):
             if row_is_reached(f, row, knobs) and (open_rows >> row) & 1 != 0:
