@@ -109,10 +109,8 @@ def sum_id_weights(
     base: int,
     order: wp.array[int],  # [V]
     entries: wp.array[int],  # [V + 1]
-    places: wp.array[int],  # [I] position of each intersection in the tile lists
-    tiles: wp.array[int],  # [I] tile of each intersection
-    offsets: wp.array[int],  # [tiles + 1]
-    row_starts: wp.array[int],  # [tiles + 1]
+    starts: wp.array[int],  # [I] first weight of each intersection, by Gaussian
+    tiles: wp.array[int],  # [I] its tile
     tile_ids: wp.array2d[int],  # [tiles, 256]
     tile_id_counts: wp.array[int],  # [tiles]
     weights: wp.array[float],  # per fragment one weight for each id of its tile
@@ -127,15 +125,25 @@ def sum_id_weights(
     i = order[k]
     target = wp.where(by_gaussian != 0, i, k)
     total = float(0.0)
+    run = int(-1)  # neighbouring tiles mostly show the same id: its weight is written once
+    run_weight = float(0.0)
     for e in range(entries[k], entries[k + 1]):
         tile = tiles[e]
-        ids = tile_id_counts[tile]
-        place = row_starts[tile] + (places[e] - offsets[tile]) * ids
-        for m in range(ids):
-            w = weights[place + m]
+        start = starts[e]
+        for m in range(tile_id_counts[tile]):
+            w = weights[start + m]
             if w > 0.0:
-                id_weights_out[target, tile_ids[tile, m]] += w
                 total += w
+                name = tile_ids[tile, m]
+                if name == run:
+                    run_weight += w
+                else:
+                    if run >= 0:
+                        id_weights_out[target, run] += run_weight
+                    run = name
+                    run_weight = w
+    if run >= 0:
+        id_weights_out[target, run] += run_weight
     weight_out[i] += total
     weight_squared_out[i] += total * total
 

@@ -111,6 +111,7 @@ def make_lift_ids_block(ordered: bool) -> wp.Kernel:
         id_weights_out: wp.array2d[float],  # [N, M] added to (atomic variant)
         view_weights_out: wp.array[float],  # [N] added to (atomic variant)
         weights_out: wp.array[float],  # per fragment one weight for each id of its tile (ordered variant)
+        starts_out: wp.array[int],  # [I] first weight of each intersection, by Gaussian (ordered variant)
     ):
         """Sum of alpha T by id; one block per tile, 16 ids at a time."""
         tile, t = wp.tid()
@@ -142,6 +143,8 @@ def make_lift_ids_block(ordered: bool) -> wp.Kernel:
             wp.tile_assign(shares, wp.tile(weights), offset=(0, 0))
             if j < count:
                 f = fragments[start + j]
+                if wp.static(ordered) and c == 0:
+                    starts_out[f.entry] = row_starts[tile] + (start + j - first) * ids
                 for m in range(c, ids, LANES):
                     total = float(0.0)
                     for step in range(BLOCK):

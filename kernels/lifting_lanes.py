@@ -141,6 +141,7 @@ def lift_ids(
     state: wp.array3d[Lanes],  # [slots, 16, 1] scratch
     # Out:
     weights_out: wp.array[float],  # zeroed; per fragment one weight for each id of its tile
+    starts_out: wp.array[int],  # [I] first weight of each intersection, by Gaussian
 ):
     """Sum of alpha T by id: the cost does not depend on the number of feature channels."""
     tile = base + wp.tid()
@@ -153,9 +154,26 @@ def lift_ids(
     first = offsets[tile]
     count = wp.max(offsets[tile + 1] - first, 1)
     ids = (row_starts[tile + 1] - row_starts[tile]) / count
+    plain = ids == 1
+    for row in range(TILE):
+        if uniform[tile, row] != 0:
+            plain = False
     for k in range(first, offsets[tile + 1]):
         f = fragments[k]
         place = row_starts[tile] + (k - first) * ids
+        starts_out[f.entry] = place
+        if plain:
+            total = Lanes(0.0)
+            for row in range(f.first_row, f.last_row + 1):
+                if row_is_reached(f, row, knobs) and (open_rows >> row) & 1 != 0:
+                    T = state[slot, row, 0]
+                    alphas = lane_alphas(f, row, knobs)
+                    total += lane_contributions(alphas, T, knobs)
+                    state[slot, row, 0] = lane_attenuated(alphas, T, knobs)
+            weights_out[place] = lane_sum(total)
+            if (k - first) % CLOSE_EVERY == CLOSE_EVERY - 1:
+                open_rows = still_open(open_rows, state, slot)
+            continue
         run = int(-1)  # id shared by the rows summed in `total` so far
         total = Lanes(0.0)
         for row in range(f.first_row, f.last_row + 1):
@@ -185,5 +203,3 @@ def lift_ids(
             weights_out[place + run] += lane_sum(total)
         if (k - first) % CLOSE_EVERY == CLOSE_EVERY - 1:
             open_rows = still_open(open_rows, state, slot)
-            if open_rows == 0:
-                break

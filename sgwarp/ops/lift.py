@@ -266,22 +266,23 @@ def _add_ids(
         id_weights = scratch("id weights", rows * known, torch.float32, device).view(rows, known).zero_()
     knobs = tiles.knobs(settings)
     common = [view(lists.offsets, wp.int32), lists.fragments]
-    starts = view(row_starts, wp.int32)
+    row_places = view(row_starts, wp.int32)
     if atomic:
         view_weights = torch.zeros_like(sums.weight)
-        weights = torch.empty(0, device=device)
+        weights, starts = torch.empty(0, device=device), torch.empty(0, dtype=torch.int32, device=device)
     else:
         view_weights = torch.empty(0, device=device)
         weights = scratch("id entry weights", int(row_starts[-1]), torch.float32, device).zero_()
+        starts = scratch("id entry starts", lists.intersections, torch.int32, device)
     if block:
         labels = [view(local_ids, wp.int32), view(tile_ids, wp.int32), view(id_counts, wp.int32)]
-        outputs = [view(t, wp.float32) for t in (id_weights, view_weights, weights)]
+        outputs = [*(view(t, wp.float32) for t in (id_weights, view_weights, weights)), view(starts, wp.int32)]
         kernel = lifting_block.make_lift_ids_block(ordered)
-        launch_blocks(kernel, [count], [*common, *labels, starts, knobs, width, height], outputs, device=device)
+        launch_blocks(kernel, [count], [*common, *labels, row_places, knobs, width, height], outputs, device=device)
     else:
         state = lane_scratch("state", TILE_ROWS, 1, device)
-        inputs = [*common, view(local_ids, LaneIds), view(uniform, wp.int32), starts, knobs, width, height, state]
-        outputs = [view(weights, wp.float32)]
+        inputs = [*common, view(local_ids, LaneIds), view(uniform, wp.int32), row_places, knobs, width, height, state]
+        outputs = [view(weights, wp.float32), view(starts, wp.int32)]
         launch(lifting_lanes.lift_ids, count, inputs, outputs, device=device, slots=True)
     order = view(lists.order, wp.int32)
     if atomic:
@@ -289,7 +290,7 @@ def _add_ids(
         order = view(torch.arange(len(sums.weight), dtype=torch.int32, device=device), wp.int32)
         visible = len(sums.weight)
     else:
-        where = [view(t, wp.int32) for t in (lists.entries, lists.places, lists.tiles, lists.offsets, row_starts)]
+        where = [view(t, wp.int32) for t in (lists.entries, starts, lists.tiles)]
         names = [view(tile_ids, wp.int32), view(id_counts, wp.int32), view(weights, wp.float32)]
         outputs = [view(t, wp.float32) for t in (id_weights, sums.weight, sums.weight_squared)]
         launch(lifting.sum_id_weights, visible, [order, *where, *names, int(one_hot)], outputs, device=device)
