@@ -3,28 +3,81 @@
 Nothing heavy is imported until a name is used: neither torch nor warp comes with `import sgwarp`.
 """
 
+import sys
 from importlib import import_module
+from types import ModuleType
 from typing import TYPE_CHECKING, Any
 
 from sgwarp.version import __version__ as __version__
 
 if TYPE_CHECKING:
+    from sgwarp.encoders.registry import make_encoder as make_encoder
+    from sgwarp.encoders.registry import text_encoder_for as text_encoder_for
     from sgwarp.errors import InputError as InputError
+    from sgwarp.io.scenes import load_gaussians as load_gaussians
+    from sgwarp.io.scenes import save_gaussians as save_gaussians
+    from sgwarp.io.store import load_semantics as load_semantics
+    from sgwarp.io.store import save_semantics as save_semantics
+    from sgwarp.io.views import load_views as load_views
+    from sgwarp.lift import lift as lift
+    from sgwarp.ops.settings import RasterSettings as RasterSettings
+    from sgwarp.orbit import orbit_views as orbit_views
+    from sgwarp.query import query as query
+    from sgwarp.query import relevancy as relevancy
+    from sgwarp.query import select as select
+    from sgwarp.query import standardise as standardise
+    from sgwarp.render import render as render
+    from sgwarp.runlog import RunLog as RunLog
     from sgwarp.scene import Camera as Camera
     from sgwarp.scene import FeatureMap as FeatureMap
     from sgwarp.scene import Gaussians as Gaussians
     from sgwarp.scene import Semantics as Semantics
     from sgwarp.scene import View as View
+    from sgwarp.segment import localize as localize
+    from sgwarp.segment import segment as segment
 
 _HOME = {
-    "InputError": "sgwarp.errors",
     "Camera": "sgwarp.scene",
     "FeatureMap": "sgwarp.scene",
     "Gaussians": "sgwarp.scene",
+    "InputError": "sgwarp.errors",
+    "RasterSettings": "sgwarp.ops.settings",
+    "RunLog": "sgwarp.runlog",
     "Semantics": "sgwarp.scene",
     "View": "sgwarp.scene",
+    "lift": "sgwarp.lift",
+    "load_gaussians": "sgwarp.io.scenes",
+    "load_semantics": "sgwarp.io.store",
+    "load_views": "sgwarp.io.views",
+    "localize": "sgwarp.segment",
+    "make_encoder": "sgwarp.encoders.registry",
+    "orbit_views": "sgwarp.orbit",
+    "query": "sgwarp.query",
+    "relevancy": "sgwarp.query",
+    "render": "sgwarp.render",
+    "save_gaussians": "sgwarp.io.scenes",
+    "save_semantics": "sgwarp.io.store",
+    "segment": "sgwarp.segment",
+    "select": "sgwarp.query",
+    "standardise": "sgwarp.query",
+    "text_encoder_for": "sgwarp.encoders.registry",
 }
 __all__ = [*_HOME, "__version__"]
+
+
+class _Package(ModuleType):
+    """`sgwarp.lift` is the function, whether or not something has imported the module of the same name.
+
+    The import system binds a submodule to its name in the package once it is loaded; here a public name wins.
+    """
+
+    def __setattr__(self, name: str, value: Any) -> None:
+        if isinstance(value, ModuleType) and name in _HOME:
+            value = getattr(value, name)
+        super().__setattr__(name, value)
+
+
+sys.modules[__name__].__class__ = _Package
 
 
 def __getattr__(name: str) -> Any:

@@ -1,6 +1,6 @@
 """Rasterizer and lifting against their limits: ratios taken in one run, printed and written to JSON.
 
-    python benchmarks/run.py [--counts 20000 100000 500000] [--out benchmarks/results.json]
+    python -m benchmarks [--counts 20000 100000 500000] [--out benchmarks/results.json]
 
 (a) a plain scalar Warp kernel, one thread per pixel (scalar.py); (b) the same work by hand in C++ with OpenMP
 (limit.cpp), called "the limit"; (c) one host thread against all. Every figure is the smallest of several runs, the
