@@ -22,7 +22,7 @@ def cuda_kernels() -> list[wp.Kernel]:
     """All kernels defined in kernels/ but the lane schedule's, which only the CPU runs, and one of each factory."""
     kernels = []
     for info in pkgutil.iter_modules(sgwarp.kernels.__path__):
-        if not info.name.endswith("_lanes"):
+        if "_lanes" not in info.name:
             module = importlib.import_module(f"sgwarp.kernels.{info.name}")
             kernels += [
                 k for k in vars(module).values() if isinstance(k, wp.Kernel) and k.module.name == module.__name__

@@ -1,0 +1,52 @@
+# `make test` and `make demo` need Python 3.10 or later, make and a C library; everything else goes into .venv.
+.DEFAULT_GOAL := help
+.NOTPARALLEL:
+.PHONY: help test demo lint bench clean
+
+VENV := .venv
+BIN := $(VENV)/bin
+ARGS ?=
+SOURCES := $(wildcard sgwarp kernels tests notebooks benchmarks)
+
+# A name on PATH may be an empty shim, so each candidate has to run.
+PYTHON ?= $(shell for name in python3 python python3.14 python3.13 python3.12 python3.11 python3.10; do \
+	$$name -c 'import sys; sys.exit(sys.version_info < (3, 10))' >/dev/null 2>&1 && { echo $$name; break; }; done)
+
+help:
+	@echo "make test   install into $(VENV), run the tests       (ARGS='tests/io -x' for some of them)"
+	@echo "make demo   install into $(VENV), run the demonstration; pictures and a table go to demo_out/"
+	@echo "make lint   ruff and mypy"
+	@echo "make bench  the benchmarks, as ratios within one run"
+	@echo "make clean  remove what the other targets built"
+
+test: $(VENV)/installed-test
+	$(BIN)/python -m pytest $(ARGS)
+
+demo: $(VENV)/installed-demo
+	$(BIN)/sgwarp demo --out demo_out $(ARGS)
+
+lint: $(VENV)/installed-dev
+	$(BIN)/ruff check $(SOURCES)
+	$(BIN)/ruff format --check $(SOURCES)
+	$(BIN)/mypy
+
+bench: $(VENV)/installed-test
+	$(BIN)/python -m benchmarks $(ARGS)
+
+clean:
+	rm -rf $(VENV) demo_out build dist .pytest_cache .mypy_cache .ruff_cache .hypothesis
+	find $(SOURCES) -name __pycache__ -type d -prune -exec rm -rf {} +
+
+$(VENV)/installed-test: EXTRAS = test,ptx
+$(VENV)/installed-demo: EXTRAS = demo
+$(VENV)/installed-dev: EXTRAS = dev
+
+# One stamp per set of extras: installed again only when what is asked for changes.
+$(VENV)/installed-%: pyproject.toml constraints.txt | $(BIN)/python
+	@echo "installing sgwarp[$(EXTRAS)] into $(VENV); the first time takes some minutes"
+	$(BIN)/python -m pip install --disable-pip-version-check --quiet -c constraints.txt -e '.[$(EXTRAS)]'
+	@touch $@
+
+$(BIN)/python:
+	@test -n "$(PYTHON)" || { echo "make: no Python 3.10 or later found; install one or say make PYTHON=/path/to/python3" >&2; exit 1; }
+	$(PYTHON) -m venv $(VENV)

@@ -1,0 +1,13 @@
+"""The subcommands of `sgwarp`: one dataclass each, whose fields are the options and whose `run` does the work.
+
+Only `sgwarp.cli` imports this package, once tyro is known to be there; torch and warp come with `run`.
+"""
+
+from sgwarp.commands.demo import Demo
+from sgwarp.commands.info import Info
+from sgwarp.commands.lift import Lift
+from sgwarp.commands.query import Query
+from sgwarp.commands.render import Render
+from sgwarp.commands.segment import Segment
+
+COMMANDS = {"lift": Lift, "query": Query, "segment": Segment, "render": Render, "info": Info, "demo": Demo}

@@ -1,0 +1,26 @@
+"""`sgwarp demo`: the whole way on a room that ships with the package."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+
+from sgwarp.commands.options import Options, check_folder
+from sgwarp.errors import InputError
+
+
+@dataclass(kw_only=True)
+class Demo(Options):
+    """Lift the default encoder into the room that ships with the package, ask for its furniture, measure and draw."""
+
+    out: Path = Path("demo_out")
+    """Folder for the pictures, report.md and run.json."""
+
+    def run(self) -> None:
+        check_folder("--out", self.out)
+        if self.device != "cpu":
+            raise InputError(f"--device {self.device}: the demo runs on the CPU; use the other commands on CUDA")
+        self.start()
+        from sgwarp.demo.run import run_demo
+
+        run_demo(self.out)

@@ -1,0 +1,71 @@
+"""`sgwarp lift`: 2D semantics of posed views into a scene."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Literal
+
+from sgwarp.commands.options import SceneOptions, check_name, find_views
+from sgwarp.progress import show_progress
+
+
+@dataclass(kw_only=True)
+class Lift(SceneOptions):
+    """Lift the 2D semantics of posed views into the Gaussians of a scene."""
+
+    views: Path
+    """Posed photographs: a folder with transforms.json or a COLMAP model."""
+
+    out: Path
+    """Semantics file to write, .safetensors; run.json goes beside it."""
+
+    encoder: str = "conse"
+    """Where the 2D semantics come from: the name of an encoder, or files:DIR for one file per view."""
+
+    mode: Literal["weighted", "center"] = "weighted"
+    """weighted: all pixels a Gaussian contributes to; center: the pixel of its centre, with a depth test."""
+
+    tau: float = 0.05
+    """Relative depth tolerance of mode center."""
+
+    border: int = 10
+    """Pixels along the image edge that mode center ignores."""
+
+    share_of_views: float = 1.0
+    """Use only this share of the views, evenly spread."""
+
+    photographs: bool = True
+    """Off: ignore the photographs and render the views from the scene."""
+
+    deterministic: bool = False
+    """On CUDA, add up in a fixed order: slower, the same bits every time. The CPU always does."""
+
+    def run(self) -> None:
+        check_name("--out", self.out, ".safetensors")
+        with self.logged(self.out.parent) as log:
+            from sgwarp.encoders.registry import make_encoder
+            from sgwarp.io.store import save_semantics
+            from sgwarp.lift import lift
+
+            gaussians = self.load_scene(log)
+            views = find_views(self.views, photographs=self.photographs)
+            with log.stage("load_encoder"):
+                source = make_encoder(self.encoder, views, self.device)
+            with show_progress("lift") as progress:
+                semantics = lift(
+                    gaussians,
+                    views,
+                    source,
+                    self.mode,
+                    tau=self.tau,
+                    border=self.border,
+                    share_of_views=self.share_of_views,
+                    deterministic=self.deterministic or None,
+                    progress=progress,
+                    log=log,
+                )
+            notes = {"encoder": self.encoder, "mode": self.mode, "views": len(views)}
+            with log.stage("write"):
+                save_semantics(semantics, self.out, notes)
+            log.outputs.append(str(self.out))

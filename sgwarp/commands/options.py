@@ -1,0 +1,150 @@
+"""Options that every command takes, and how it starts and ends."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import TYPE_CHECKING, Literal
+
+import tyro
+
+from sgwarp.errors import InputError
+from sgwarp.runlog import RunLog
+
+if TYPE_CHECKING:
+    from torch import Tensor
+
+    from sgwarp.scene import Gaussians, Semantics, View
+
+
+@dataclass(kw_only=True)
+class Options:
+    device: Literal["cpu", "cuda"] = "cpu"
+    """Where to compute."""
+
+    threads: int | None = None
+    """Host threads on the CPU; all cores if not given."""
+
+    command_line: tyro.conf.Suppress[str] = field(default="", repr=False)
+
+    @contextmanager
+    def logged(self, folder: Path) -> Iterator[RunLog]:
+        """Yield the log of this run; `run.json` goes into `folder` if the block succeeds, and one line to stdout."""
+        log = self.start()
+        yield log
+        log.write(folder)
+        print(log.summary())
+
+    def start(self) -> RunLog:
+        """Set the threads and the device.
+
+        Raises:
+            InputError: There is no CUDA device, or the number of threads is not positive.
+        """
+        import torch
+
+        from sgwarp.ops.launch import get_threads, set_threads
+
+        if self.threads is not None:
+            if self.threads < 1:
+                raise InputError(f"--threads: expected 1 or more, got {self.threads}")
+            set_threads(self.threads)
+            torch.set_num_threads(self.threads)
+        if self.device == "cuda" and not torch.cuda.is_available():
+            raise InputError("--device cuda: this machine or this torch has no CUDA device; use --device cpu")
+        return RunLog(command=self.command_line, device=self.device, threads=get_threads())
+
+
+@dataclass(kw_only=True)
+class SceneOptions(Options):
+    scene: tyro.conf.Positional[Path]
+    """The trained scene, a .ply file."""
+
+    def load_scene(self, log: RunLog) -> Gaussians:
+        """The scene on the chosen device.
+
+        Raises:
+            InputError: It cannot be read, or is empty.
+        """
+        from sgwarp.io.scenes import load_gaussians
+
+        with log.stage("read"):
+            gaussians = load_gaussians(self.scene).to(self.device)
+        if not len(gaussians):
+            raise InputError(f"{self.scene}: holds no Gaussians")
+        return gaussians
+
+
+@dataclass(kw_only=True)
+class SemanticsOptions(SceneOptions):
+    semantics: Path
+    """What `sgwarp lift` wrote for this scene."""
+
+    def load_both(self, log: RunLog) -> tuple[Gaussians, Semantics]:
+        """The scene and its semantics on the chosen device.
+
+        Raises:
+            InputError: One of them cannot be read, or they do not belong together.
+        """
+        from dataclasses import replace
+
+        from sgwarp.io.store import load_semantics
+
+        gaussians = self.load_scene(log)
+        with log.stage("read"):
+            semantics = load_semantics(self.semantics, gaussians)
+            names = ("features", "weight", "effective_views")
+            semantics = replace(semantics, **{name: getattr(semantics, name).to(self.device) for name in names})
+        return gaussians, semantics
+
+
+def find_views(folder: Path, stem: str | None = None, photographs: bool = True) -> list[View]:
+    """All views of a folder, or the one named `stem`.
+
+    Raises:
+        InputError: The folder holds no views, or none of that name.
+    """
+    from sgwarp.io.views import load_views
+
+    views = load_views(folder, photographs=photographs)
+    if stem is None:
+        return views
+    chosen = [view for view in views if view.stem == stem]
+    if not chosen:
+        some = ", ".join(view.stem for view in views[:5])
+        raise InputError(f"{folder}: has no view '{stem}'; its {len(views)} views are named {some}, ...")
+    return chosen
+
+
+def photograph(gaussians: Gaussians, view: View) -> Tensor:
+    """The view's photograph, or without one its rendering, float32 [H, W, 3] on the CPU."""
+    if view.image_path is not None:
+        return view.image()
+    from sgwarp.render import render
+
+    return render(gaussians, view.camera).clamp(0.0, 1.0).cpu()
+
+
+def check_name(option: str, path: Path, suffix: str) -> None:
+    """Refuse an output name before the work is done, not after.
+
+    Raises:
+        InputError: The name ends in something else, or its folder is a file.
+    """
+    if path.suffix != suffix:
+        raise InputError(f"{option} {path}: the name must end in {suffix}")
+    check_folder(option, path.parent)
+
+
+def check_folder(option: str, folder: Path) -> None:
+    """Refuse an output folder that cannot be written to.
+
+    Raises:
+        InputError: It is a file, lies below a file, or is write protected.
+    """
+    existing = next(path for path in (folder, *folder.absolute().parents) if path.exists())
+    if not existing.is_dir() or not os.access(existing, os.W_OK):
+        raise InputError(f"{option} {folder}: {existing} is not a folder that can be written to; choose another")

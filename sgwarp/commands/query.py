@@ -1,0 +1,78 @@
+"""`sgwarp query`: where in a view is what a text names?"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Literal
+
+from sgwarp.commands.options import SemanticsOptions, check_name, find_views, photograph
+from sgwarp.errors import InputError
+
+if TYPE_CHECKING:
+    from torch import Tensor
+
+    from sgwarp.runlog import RunLog
+    from sgwarp.scene import Semantics
+
+
+@dataclass(kw_only=True)
+class Query(SemanticsOptions):
+    """Find what a text names: prints the best pixel of a view, writes a mask and a heat map."""
+
+    views: Path
+    """Posed photographs: a folder with transforms.json or a COLMAP model."""
+
+    text: str
+    """What to look for; for semantics lifted from label images, one of their labels."""
+
+    view: str
+    """Name of the view to look at."""
+
+    out: Path
+    """Mask to write, .png, 255 on what was found and 0 elsewhere; the heat map {out}_heat.png goes beside it."""
+
+    score: Literal["cosine", "relevancy"] = "cosine"
+    """relevancy: how much better the text fits than "object", "things", "stuff" and "texture"."""
+
+    threshold: float = 0.5
+    """Least score of a pixel of the mask, where 0 is the scene's median score and 1 its best thousandth."""
+
+    box: int = 9
+    """Side of the box over which scores are averaged before the best pixel is taken [pixels]."""
+
+    def run(self) -> None:
+        check_name("--out", self.out, ".png")
+        if not self.text.strip():
+            raise InputError("--text: is empty; say what to look for")
+        with self.logged(self.out.parent) as log:
+            from sgwarp.io.images import write_ids, write_rgb
+            from sgwarp.pictures import heat_map, mark_pixel
+            from sgwarp.segment import localize
+
+            gaussians, semantics = self.load_both(log)
+            (view,) = find_views(self.views, self.view)
+            scores = self._scores(semantics, log)
+            with log.stage("splat"):
+                (x, y), score_map = localize(scores, gaussians, view.camera, seen=semantics.seen, box=self.box)
+            mask = score_map > self.threshold
+            print(f"{self.text}: best pixel ({x}, {y}), score {score_map[y, x]:.3f}; mask {mask.float().mean():.2%}")
+            with log.stage("write"):
+                heat = self.out.with_name(f"{self.out.stem}_heat.png")
+                picture = heat_map(photograph(gaussians, view), score_map, low=0.0, high=1.0)
+                write_ids(self.out, mask.byte().mul(255).cpu())
+                write_rgb(heat, mark_pixel(picture, (x, y)))
+            log.outputs += [str(self.out), str(heat)]
+
+    def _scores(self, semantics: Semantics, log: RunLog) -> Tensor:
+        """Score of every Gaussian on the scale of the mask, [N]."""
+        from sgwarp.encoders.registry import text_encoder_for
+        from sgwarp.query import class_votes, query, relevancy, rescale
+
+        if semantics.labels is not None:
+            return class_votes(semantics, [self.text])[:, 0]
+        with log.stage("load_encoder"):
+            encoder = text_encoder_for(semantics.space)
+        with log.stage("query"):
+            score = query if self.score == "cosine" else relevancy
+            return rescale(score(semantics, [self.text], encoder), semantics.seen)[:, 0]

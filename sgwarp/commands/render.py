@@ -1,0 +1,89 @@
+"""`sgwarp render`: pictures of a scene."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Literal
+
+from sgwarp.commands.options import SceneOptions, check_folder, find_views
+from sgwarp.errors import InputError
+from sgwarp.progress import show_progress
+
+if TYPE_CHECKING:
+    from torch import Tensor
+
+    from sgwarp.scene import Gaussians, View
+
+
+@dataclass(kw_only=True)
+class Render(SceneOptions):
+    """Render the views, or a turn around the scene if no views are given."""
+
+    out: Path
+    """Folder for {stem}.png, and for depth also {stem}.npy: z per pixel in scene units, float32 [H, W], 0 for none."""
+
+    views: Path | None = None
+    """Cameras: a folder with transforms.json or a COLMAP model. The photographs need not be there."""
+
+    view: str | None = None
+    """Only the view of this name."""
+
+    mode: Literal["rgb", "depth", "expected_depth", "alpha"] = "rgb"
+    """What to render."""
+
+    background: Literal["black", "white"] = "black"
+    """What shows where the scene is transparent."""
+
+    frames: int = 12
+    """Views of the turn around the scene."""
+
+    size: tuple[int, int] = (640, 480)
+    """Width and height of the turn's views [pixels]."""
+
+    up: Literal["y-down", "y-up", "z-up", "z-down"] = "y-down"
+    """Direction of the scene's axes, for the turn: y-down for most scenes from photographs."""
+
+    def run(self) -> None:
+        check_folder("--out", self.out)
+        if self.view is not None and self.views is None:
+            raise InputError(f"--view {self.view}: needs --views, the folder that holds it")
+        with self.logged(self.out) as log:
+            from sgwarp.render import render
+
+            gaussians = self.load_scene(log)
+            views = self._views(gaussians)
+            background = gaussians.means.new_ones(3) if self.mode == "rgb" and self.background == "white" else None
+            with show_progress("render") as progress:
+                progress(0, len(views), "")
+                for done, view in enumerate(views, start=1):
+                    with log.stage("render"):
+                        image = render(gaussians, view.camera, self.mode, background=background, log=log)
+                    with log.stage("write"):
+                        log.outputs += self._write(view.stem, image.cpu())
+                    progress(done, len(views), view.stem)
+
+    def _views(self, gaussians: Gaussians) -> list[View]:
+        if self.views is not None:
+            return find_views(self.views, self.view, photographs=False)
+        from sgwarp.orbit import orbit_views
+
+        return orbit_views(gaussians, self.frames, *self.size, up=self.up)
+
+    def _write(self, stem: str, image: Tensor) -> list[str]:
+        """The picture, and for depth the numbers; returns their paths."""
+        import numpy as np
+
+        from sgwarp.io.atomic import atomic_path
+        from sgwarp.io.images import write_rgb
+        from sgwarp.pictures import depth_picture
+
+        path = self.out / f"{stem}.png"
+        if self.mode in ("rgb", "alpha"):
+            write_rgb(path, image if self.mode == "rgb" else image[..., None].expand(-1, -1, 3))
+            return [str(path)]
+        numbers = self.out / f"{stem}.npy"
+        with atomic_path(numbers) as temporary:
+            np.save(temporary, image.numpy())
+        write_rgb(path, depth_picture(image))
+        return [str(path), str(numbers)]

@@ -1,0 +1,110 @@
+"""`sgwarp segment`: a class for every pixel of the views."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from sgwarp.commands.options import SemanticsOptions, check_folder, find_views, photograph
+from sgwarp.errors import InputError
+from sgwarp.progress import show_progress
+
+if TYPE_CHECKING:
+    from torch import Tensor
+
+    from sgwarp.scene import Semantics, View
+
+
+@dataclass(kw_only=True)
+class Segment(SemanticsOptions):
+    """Write label images of the views, and the same in colour over the photographs."""
+
+    views: Path
+    """Posed photographs: a folder with transforms.json or a COLMAP model."""
+
+    out: Path
+    """Folder for {stem}.png, the index in the list of classes per pixel, 255 where unknown; and overlays/{stem}.png."""
+
+    classes: str | None = None
+    """Names separated by commas: "couch,potted plant,floor". Semantics lifted from label or id images need none: the
+    pixels then hold the ids of those images, 0 where unknown."""
+
+    view: str | None = None
+    """Only the view of this name."""
+
+    temperature: float = 0.1
+    """Of the softmax over the classes, per Gaussian."""
+
+    unknown_below: float = 0.0
+    """Pixels whose best class has a smaller confidence are unknown, 0 to 1."""
+
+    def run(self) -> None:
+        check_folder("--out", self.out)
+        classes = None if self.classes is None else class_names(self.classes)
+        with self.logged(self.out) as log:
+            from sgwarp.encoders.registry import text_encoder_for
+            from sgwarp.query import class_votes
+            from sgwarp.segment import segment_votes
+
+            gaussians, semantics = self.load_both(log)
+            views = find_views(self.views, self.view)
+            encoder = None
+            if classes is not None and semantics.labels is None:
+                with log.stage("load_encoder"):
+                    encoder = text_encoder_for(semantics.space)
+            with log.stage("query"):
+                votes = class_votes(semantics, classes, encoder, self.temperature)
+            lifted = semantics if classes is None else None
+            unknown = 0.0
+            with show_progress("segment") as progress:
+                progress(0, len(views), "")
+                for done, view in enumerate(views, start=1):
+                    with log.stage("segment"):
+                        channel, _ = segment_votes(
+                            gaussians, view.camera, votes, semantics.seen, unknown_below=self.unknown_below
+                        )
+                    with log.stage("write"):
+                        log.outputs += self._write(view, photograph(gaussians, view), channel.cpu(), classes, lifted)
+                    unknown += float((channel < 0).float().mean())
+                    progress(done, len(views), view.stem)
+            log.error["unknown"] = unknown / len(views)
+
+    def _write(
+        self, view: View, image: Tensor, channel: Tensor, classes: list[str] | None, lifted: Semantics | None
+    ) -> list[str]:
+        """Label image and overlay of one view; returns their paths."""
+        import numpy as np
+
+        from sgwarp.io.images import write_ids, write_rgb
+        from sgwarp.pictures import class_colours, overlay, with_legend
+        from sgwarp.segment import label_image
+
+        labels = label_image(channel, lifted).numpy()
+        path = self.out / f"{view.stem}.png"
+        if labels.max() > 65535:
+            raise InputError(f"view {view.stem}: id {labels.max()} does not fit a 16-bit image")
+        write_ids(path, labels.astype(np.uint8 if labels.max() <= 255 else np.uint16))
+        names = classes or list(lifted.labels or () if lifted else ())
+        colours = class_colours(len(names))
+        picture = overlay(image, channel, colours)
+        if classes is not None:
+            picture = with_legend(picture, classes, colours)
+        picture_path = self.out / "overlays" / f"{view.stem}.png"
+        write_rgb(picture_path, picture)
+        return [str(path), str(picture_path)]
+
+
+def class_names(text: str) -> list[str]:
+    """The names between the commas.
+
+    Raises:
+        InputError: A name is empty or stands twice.
+    """
+    names = [name.strip() for name in text.split(",")]
+    if not all(names):
+        raise InputError(f"--classes {text!r}: name {names.index('') + 1} is empty")
+    twice = [name for name in names if names.count(name) > 1]
+    if twice:
+        raise InputError(f"--classes {text!r}: '{twice[0]}' stands there twice")
+    return names

@@ -1,0 +1,1 @@
+"""Figures of merit: segmentation from one confusion matrix, localisation from hits."""

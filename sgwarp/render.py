@@ -1,0 +1,67 @@
+"""A scene seen from a camera: colour, depth, opacity or any per-Gaussian features."""
+
+from __future__ import annotations
+
+from typing import Literal, get_args
+
+from torch import Tensor
+
+from sgwarp.errors import InputError
+from sgwarp.ops.rasterize import rasterize
+from sgwarp.ops.settings import RasterSettings
+from sgwarp.runlog import RunLog
+from sgwarp.scene import Camera, Gaussians
+
+RenderMode = Literal["rgb", "depth", "expected_depth", "alpha", "features"]
+
+
+def render(
+    gaussians: Gaussians,
+    camera: Camera,
+    mode: RenderMode = "rgb",
+    features: Tensor | None = None,
+    background: Tensor | None = None,
+    settings: RasterSettings | None = None,
+    log: RunLog | None = None,
+) -> Tensor:
+    """Render one image.
+
+    Args:
+        gaussians: The scene.
+        camera: Where it is seen from.
+        mode: "rgb" (float32 [H, W, 3], not clamped), "depth" (z of the surface, where accumulated opacity passes
+            `settings.surface_opacity` [m], 0 where it never does, [H, W]), "expected_depth" (mean z under the blending
+            weights [m], [H, W]), "alpha" (accumulated opacity, [H, W]) or "features" (`features` blended, [H, W, C]).
+        features: One row per Gaussian, float32 [N, C]; only for mode "features".
+        background: What shows where the scene is transparent, one value per channel, [C]; zero if None.
+        settings: Thresholds of the rasterizer.
+        log: Counts the Gaussians that were left out, by reason, as `culled_...`.
+
+    Raises:
+        InputError: Unknown mode, or features missing where they are needed or given where they are not.
+    """
+    if mode not in get_args(RenderMode):
+        raise InputError(f"mode: '{mode}' is not one of {', '.join(get_args(RenderMode))}")
+    if (mode == "features") != (features is not None):
+        raise InputError(f"mode '{mode}': features [N, C] belong to mode 'features', and only to it")
+    settings = settings or RasterSettings()
+    if mode in ("rgb", "features"):
+        rendering = rasterize(gaussians, camera, features, background=background, settings=settings)
+        image = rendering.features
+    else:
+        # No colour is asked for: one empty channel keeps spherical harmonics out of the work.
+        nothing = gaussians.means.new_zeros(len(gaussians), 1)
+        rendering = rasterize(
+            gaussians,
+            camera,
+            nothing,
+            expected_depth=mode == "expected_depth",
+            depth=mode == "depth",
+            settings=settings,
+        )
+        image = getattr(rendering, mode)
+    if log is not None:
+        for reason, count in rendering.culled.items():
+            log.leave_out(f"culled_{reason}", count)
+    assert isinstance(image, Tensor)
+    return image

@@ -1,0 +1,99 @@
+"""Regions, their squares and their means, against slow loops."""
+
+import cv2
+import numpy as np
+import pytest
+import torch
+
+from sgwarp.encoders.imagenet_classifier import STRIDE, LogitMap
+from sgwarp.encoders.regions import bounding_squares, cut_squares, region_areas, region_means, segment_regions
+
+
+@pytest.fixture
+def regions():
+    """A partition with thin, large and scattered regions."""
+    parts = np.zeros((20, 30), np.int32)
+    parts[3:7, 5:25] = 1
+    parts[15, 2] = 2
+    parts[0, 0] = parts[19, 29] = 3
+    return parts
+
+
+def test_segmentation_finds_plain_shapes():
+    image = np.full((60, 80, 3), 200, np.uint8)
+    cv2.rectangle(image, (10, 10), (34, 39), (20, 60, 220), -1)
+    cv2.circle(image, (60, 30), 12, (30, 200, 30), -1)
+    found = segment_regions(image, 100, 20)
+    inside = [image[y, x].tolist() for y, x in [(20, 20), (30, 60), (55, 5)]]
+    numbers = [found[20, 20], found[30, 60], found[55, 5]]
+    assert sorted(np.unique(found)) == list(range(found.max() + 1))
+    assert len(set(numbers)) == 3
+    for number, colour in zip(numbers, inside, strict=True):
+        same = (image == colour).all(axis=2)
+        assert ((found == number) & same).sum() / ((found == number) | same).sum() > 0.8
+
+
+def test_areas_and_squares(regions):
+    squares = bounding_squares(regions, 1.5)
+    for number in range(regions.max() + 1):
+        y, x = np.nonzero(regions == number)
+        assert region_areas(regions)[number] == len(y)
+        side = 1.5 * max(y.max() - y.min() + 1, x.max() - x.min() + 1)
+        middle = (x.min() + x.max() + 1) / 2, (y.min() + y.max() + 1) / 2
+        np.testing.assert_allclose(squares[number], [middle[0] - side / 2, middle[1] - side / 2, side])
+
+
+def test_cut_squares():
+    image = np.random.default_rng(0).integers(0, 255, (20, 30, 3)).astype(np.uint8)
+    whole, over_the_edge = cut_squares(image, np.array([[4.0, 2, 10], [-5, -5, 10]]), 10)
+    assert (whole == image[2:12, 4:14]).all()
+    assert (over_the_edge[5:, 5:] == image[:5, :5]).all()
+    assert (over_the_edge[:5] == 127).all()
+    assert (over_the_edge[:, :5] == 127).all()
+
+
+def test_squares_shrink_to_their_mean():
+    image = np.random.default_rng(0).integers(0, 255, (16, 16, 3)).astype(np.uint8)
+    (small,) = cut_squares(image, np.array([[0.0, 0, 16]]), 2)
+    wanted = image.reshape(2, 8, 2, 8, 3).mean(axis=(1, 3))
+    np.testing.assert_allclose(small, wanted, atol=1)
+
+
+def test_interpolation_reads_a_map_at_the_centres_of_its_locations():
+    """A map whose values are the positions of its locations gives those of the pixels, but at its edges."""
+    first, inputs = 3.0, (96, 160)
+    y, x = torch.meshgrid(torch.arange(3.0), torch.arange(5.0), indexing="ij")
+    found = LogitMap(torch.stack([y, x], dim=-1) * STRIDE + first, inputs, first)
+    rows, columns = found.interpolation(48, 80)
+    read = torch.einsum("yi,xj,ijk->yxk", rows, columns, found.logits)
+    for row in range(48):
+        for column in range(80):
+            wanted = [
+                min(max((place + 0.5) * 2 - 0.5, first), first + STRIDE * last)
+                for place, last in ((row, 2), (column, 4))
+            ]
+            np.testing.assert_allclose(read[row, column], wanted, rtol=1e-5)
+
+
+@pytest.mark.parametrize("locations", [(1, 1), (2, 3), (4, 6)])
+def test_region_means_equal_a_loop_over_pixels(regions, locations):
+    values = torch.randn(*locations, 7, dtype=torch.float64, generator=torch.Generator().manual_seed(0))
+    found = LogitMap(values, (locations[0] * STRIDE, locations[1] * STRIDE), 3.0)
+    rows, columns = found.interpolation(*regions.shape)
+    means = region_means(regions, rows, columns, values.float())
+    for number in range(regions.max() + 1):
+        wanted = torch.zeros(7, dtype=torch.float64)
+        pixels = np.argwhere(regions == number)
+        for y, x in pixels:
+            for i in range(locations[0]):
+                for j in range(locations[1]):
+                    wanted += float(rows[y, i]) * float(columns[x, j]) * values[i, j]
+        np.testing.assert_allclose(means[number], wanted / len(pixels), rtol=1e-5, atol=1e-6)
+
+
+def test_opencv_without_contributed_modules(monkeypatch):
+    from sgwarp.errors import InputError
+
+    monkeypatch.delattr(cv2, "ximgproc")
+    with pytest.raises(InputError, match="pip install opencv-contrib-python-headless"):
+        segment_regions(np.zeros((8, 8, 3), np.uint8), 100, 10)

@@ -1,0 +1,81 @@
+"""Every notebook runs from top to bottom without a warning, and what it finds on the way is right."""
+
+import runpy
+from pathlib import Path
+
+import jupytext
+import matplotlib
+import nbformat
+import pytest
+import warp as wp
+
+from sgwarp.ops import launch  # noqa: F401 - starts Warp quietly
+
+FOLDER = Path(__file__).resolve().parents[1] / "notebooks"
+NOTEBOOKS = sorted(FOLDER.glob("*.py"))
+
+
+def test_there_are_notebooks():
+    assert FOLDER / "01_kernels.py" in NOTEBOOKS
+
+
+@pytest.mark.parametrize("path", NOTEBOOKS, ids=lambda path: path.stem)
+def test_it_is_a_valid_notebook(path):
+    notebook = jupytext.read(path, fmt="py:percent")
+    nbformat.validate(notebook)
+    first, *others = notebook.cells
+    assert first.cell_type == "markdown"
+    assert first.source.startswith("# ")
+    assert len(first.source) > 200, "a notebook opens with what the reader learns"
+    assert any(cell.cell_type == "code" for cell in others)
+
+
+@pytest.fixture
+def run(monkeypatch: pytest.MonkeyPatch):
+    """Run a notebook as a script: its variables, and how many figures it showed."""
+    matplotlib.use("Agg")
+    import matplotlib.pyplot as plt
+
+    shown = []
+
+    def draw_and_close() -> None:
+        figures = [plt.figure(number) for number in plt.get_fignums()]
+        for figure in figures:
+            figure.set_dpi(40)
+            figure.canvas.draw()
+        shown.extend(figures)
+        plt.close("all")
+
+    monkeypatch.setattr(plt, "show", draw_and_close)
+    device = wp.get_device()
+    with matplotlib.rc_context():
+        yield lambda name: (runpy.run_path(str(FOLDER / name)), len(shown))
+    assert not plt.get_fignums(), "a figure was never shown"
+    wp.set_device(device)
+
+
+def test_kernels(run, capsys):
+    found, figures = run("01_kernels.py")
+    assert figures == 11
+    assert "largest difference to sg.render" in capsys.readouterr().out
+    assert not wp.config.enable_cpu_blocks
+
+    assert found["culled"]["non_finite"] == 40
+    assert all(found["culled"].values()), "every reason to leave a Gaussian out occurs"
+    assert sum(found["culled"].values()) == found["N"]
+    assert len(found["touched"]) < found["in_box"][found["one"]]
+
+    assert found["difference_to_render"] < 1e-5
+    assert found["ray_error"] < 1e-5
+    assert found["lane_block_difference"] < 1e-5
+    assert found["difference_to_lift"] < 1e-5
+    assert found["transpose_gap"] < 1e-6
+
+    any_weight, enough_weight = found["label_accuracies"]
+    assert any_weight < 0.9 < 0.97 < enough_weight
+    one_view, many_views = found["class_accuracies"]
+    assert one_view < 0.85 < 0.95 < many_views
+    weighted, over_a_tenth, centre = (found["coverage"][name] for name in found["coverage"])
+    assert weighted[-1] > over_a_tenth[-1] > centre[-1] > 0.8
+    for shares in found["coverage"].values():
+        assert shares == sorted(shares)
