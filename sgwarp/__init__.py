@@ -14,6 +14,7 @@ if TYPE_CHECKING:
     from sgwarp.encoders.registry import make_encoder as make_encoder
     from sgwarp.encoders.registry import text_encoder_for as text_encoder_for
     from sgwarp.errors import InputError as InputError
+    from sgwarp.from_depth import gaussians_from_depth as gaussians_from_depth
     from sgwarp.io.scenes import load_gaussians as load_gaussians
     from sgwarp.io.scenes import save_gaussians as save_gaussians
     from sgwarp.io.store import load_semantics as load_semantics
@@ -22,6 +23,7 @@ if TYPE_CHECKING:
     from sgwarp.lift import lift as lift
     from sgwarp.ops.settings import RasterSettings as RasterSettings
     from sgwarp.orbit import orbit_views as orbit_views
+    from sgwarp.query import evidence as evidence
     from sgwarp.query import query as query
     from sgwarp.query import relevancy as relevancy
     from sgwarp.query import select as select
@@ -45,6 +47,8 @@ _HOME = {
     "RunLog": "sgwarp.runlog",
     "Semantics": "sgwarp.scene",
     "View": "sgwarp.scene",
+    "evidence": "sgwarp.query",
+    "gaussians_from_depth": "sgwarp.from_depth",
     "lift": "sgwarp.lift",
     "load_gaussians": "sgwarp.io.scenes",
     "load_semantics": "sgwarp.io.store",

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from typing import Literal
 
 import torch
 from torch import Tensor
@@ -57,6 +58,19 @@ def standardise(scores: Tensor, seen: Tensor) -> Tensor:
     return torch.where(seen[:, None], scaled, 0.0).to(scores.dtype)
 
 
+def evidence(scores: Tensor, semantics: Semantics) -> Tensor:
+    """How far scores [N, Q] stand out from the scene, trusted as far as the Gaussian was seen.
+
+    `standardise`, times w / (w + median w) with w the weight behind a Gaussian's feature: one that a single grazing
+    pixel saw says little. 0 is the scene's mean, 1 its deviation; 0 where nothing was seen.
+    """
+    weight = semantics.weight.to(scores.device)
+    seen = semantics.seen.to(scores.device)
+    if not bool(seen.any()):
+        return torch.zeros_like(scores)
+    return standardise(scores, seen) * (weight / (weight + weight[seen].median()))[:, None]
+
+
 def rescale(scores: Tensor, seen: Tensor) -> Tensor:
     """Scores [N, Q] on a scale where 0 is the median over the seen Gaussians and 1 the best thousandth of them.
 
@@ -83,16 +97,32 @@ def confidence(scores: Tensor, temperature: float) -> Tensor:
     return torch.softmax(scores / temperature, dim=-1)
 
 
+Scoring = Literal["evidence", "cosine"]
+TEMPERATURES: dict[Scoring, float] = {"evidence": 0.3, "cosine": 0.1}
+NONE_LEVEL = 1.0  # evidence of "none of these": a class must stand out further from the scene's mean
+
+
 def class_votes(
     semantics: Semantics,
     classes: Sequence[str] | None,
     encoder: TextEncoder | None = None,
-    temperature: float = 0.1,
+    temperature: float | None = None,
+    scoring: Scoring = "cosine",
 ) -> Tensor:
     """How much every Gaussian speaks for every class, float32 [N, Q]; 0 where nothing was seen.
 
-    In a text space the softmax over the classes' cosines; for lifted label or id images the lifted shares themselves,
-    of all labels if `classes` is None.
+    For lifted label or id images the lifted shares themselves, of all labels if `classes` is None. In a text space:
+
+    - "evidence": softmax over the classes' `evidence` and a level for none of them. No class wins everywhere by being
+      loud, and what fits none of the names goes to none; for a list of what to look for.
+    - "cosine": softmax over the cosines (paper, Sec. III-D); for a list that names everything in the scene.
+
+    Args:
+        semantics: N Gaussians.
+        classes: Q names.
+        encoder: Text encoder of the semantics' space.
+        temperature: Of the softmax; None for 0.3 (evidence) or 0.1 (cosine).
+        scoring: See above.
 
     Raises:
         InputError: No classes, or an encoder missing, where one is needed; a class that is not among the lifted labels.
@@ -108,7 +138,13 @@ def class_votes(
         raise InputError(f"classes: semantics in space '{semantics.space}' need the names of the classes to look for")
     if encoder is None:
         raise InputError(f"encoder: classes need the text encoder of space '{semantics.space}'")
-    votes = confidence(query(semantics, classes, encoder), temperature)
+    if scoring not in TEMPERATURES:
+        raise InputError(f"scoring: expected one of {', '.join(TEMPERATURES)}, got '{scoring}'")
+    scores = query(semantics, classes, encoder)
+    if scoring == "evidence":
+        scores = evidence(scores, semantics)
+        scores = torch.cat([scores, torch.full_like(scores[:, :1], NONE_LEVEL)], dim=1)
+    votes = confidence(scores, TEMPERATURES[scoring] if temperature is None else temperature)[:, : len(classes)]
     return torch.where(semantics.seen.to(votes.device)[:, None], votes, 0.0)
 
 

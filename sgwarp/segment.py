@@ -15,7 +15,7 @@ from sgwarp.encoders.base import TextEncoder
 from sgwarp.errors import InputError
 from sgwarp.ops.rasterize import rasterize
 from sgwarp.ops.settings import RasterSettings
-from sgwarp.query import class_votes
+from sgwarp.query import Scoring, class_votes
 from sgwarp.scene import Camera, Gaussians, Semantics
 
 UNKNOWN = 255  # label of a pixel that no class can claim
@@ -60,7 +60,8 @@ def segment(
     camera: Camera,
     encoder: TextEncoder | None = None,
     *,
-    temperature: float = 0.1,
+    temperature: float | None = None,
+    scoring: Scoring = "cosine",
     unknown_below: float = 0.0,
     settings: RasterSettings | None = None,
 ) -> tuple[Tensor, Tensor]:
@@ -72,7 +73,8 @@ def segment(
         classes: Names of the classes, at most 255. None for lifted label or id images: the answer then is their ids.
         camera: The view.
         encoder: Text encoder of the semantics' space; not needed for lifted label or id images.
-        temperature: Of the softmax over the classes' cosines, per Gaussian, before they are splatted.
+        temperature: Of the softmax over the classes, per Gaussian, before they are splatted; see `class_votes`.
+        scoring: "evidence" leaves unknown what fits no class, "cosine" gives every pixel a class; see `class_votes`.
         unknown_below: Pixels whose best class has a smaller confidence are unknown, in [0, 1].
         settings: Thresholds of the rasterizer.
 
@@ -88,7 +90,7 @@ def segment(
     semantics.require_scene(gaussians)
     if classes is not None and len(classes) > UNKNOWN:
         raise InputError(f"classes: at most {UNKNOWN} at a time, got {len(classes)}")
-    votes = class_votes(semantics, classes, encoder, temperature)
+    votes = class_votes(semantics, classes, encoder, temperature, scoring)
     channel, confidence = segment_votes(
         gaussians, camera, votes, semantics.seen, unknown_below=unknown_below, settings=settings
     )

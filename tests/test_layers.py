@@ -23,6 +23,7 @@ ORDER = (
     "ops",
     "compat",
     "io",
+    "rgbd",
     "from_depth",
     "datasets",
     "encoders",

@@ -67,7 +67,7 @@ class Query(SemanticsOptions):
     def _scores(self, semantics: Semantics, log: RunLog) -> Tensor:
         """Score of every Gaussian on the scale of the mask, [N]."""
         from sgwarp.encoders.registry import text_encoder_for
-        from sgwarp.query import class_votes, query, relevancy, rescale
+        from sgwarp.query import class_votes, evidence, query, relevancy, rescale
 
         if semantics.labels is not None:
             return class_votes(semantics, [self.text])[:, 0]
@@ -75,4 +75,4 @@ class Query(SemanticsOptions):
             encoder = text_encoder_for(semantics.space)
         with log.stage("query"):
             score = query if self.score == "cosine" else relevancy
-            return rescale(score(semantics, [self.text], encoder), semantics.seen)[:, 0]
+            return rescale(evidence(score(semantics, [self.text], encoder), semantics), semantics.seen)[:, 0]

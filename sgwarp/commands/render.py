@@ -21,7 +21,8 @@ class Render(SceneOptions):
     """Render the views, or a turn around the scene if no views are given."""
 
     out: Path
-    """Folder for {stem}.png, and for depth also {stem}.npy: z per pixel in scene units, float32 [H, W], 0 for none."""
+    """Folder for {stem}.png, or for one view the name of a .png. Depth is also written as .npy: z per pixel in scene
+    units, float32 [H, W], 0 for none."""
 
     views: Path | None = None
     """Cameras: a folder with transforms.json or a COLMAP model. The photographs need not be there."""
@@ -45,14 +46,17 @@ class Render(SceneOptions):
     """Direction of the scene's axes, for the turn: y-down for most scenes from photographs."""
 
     def run(self) -> None:
-        check_folder("--out", self.out)
+        folder = self.out.parent if self.out.suffix == ".png" else self.out
+        check_folder("--out", folder)
         if self.view is not None and self.views is None:
             raise InputError(f"--view {self.view}: needs --views, the folder that holds it")
-        with self.logged(self.out) as log:
+        with self.logged(folder) as log:
             from sgwarp.render import render
 
             gaussians = self.load_scene(log)
             views = self._views(gaussians)
+            if folder != self.out and len(views) > 1:
+                raise InputError(f"--out {self.out}: is one file for {len(views)} views; name a folder, or one --view")
             background = gaussians.means.new_ones(3) if self.mode == "rgb" and self.background == "white" else None
             with show_progress("render") as progress:
                 progress(0, len(views), "")
@@ -60,17 +64,22 @@ class Render(SceneOptions):
                     with log.stage("render"):
                         image = render(gaussians, view.camera, self.mode, background=background, log=log)
                     with log.stage("write"):
-                        log.outputs += self._write(view.stem, image.cpu())
+                        path = self.out if folder != self.out else folder / f"{view.stem}.png"
+                        log.outputs += self._write(path, image.cpu())
                     progress(done, len(views), view.stem)
 
     def _views(self, gaussians: Gaussians) -> list[View]:
-        if self.views is not None:
+        if self.views is None:
+            from sgwarp.orbit import orbit_views
+
+            return orbit_views(gaussians, self.frames, *self.size, up=self.up)
+        try:
             return find_views(self.views, self.view, photographs=False)
-        from sgwarp.orbit import orbit_views
+        except InputError:
+            # A file that gives no image size needs the photographs after all; else this fails for the same reason.
+            return find_views(self.views, self.view)
 
-        return orbit_views(gaussians, self.frames, *self.size, up=self.up)
-
-    def _write(self, stem: str, image: Tensor) -> list[str]:
+    def _write(self, path: Path, image: Tensor) -> list[str]:
         """The picture, and for depth the numbers; returns their paths."""
         import numpy as np
 
@@ -78,11 +87,10 @@ class Render(SceneOptions):
         from sgwarp.io.images import write_rgb
         from sgwarp.pictures import depth_picture
 
-        path = self.out / f"{stem}.png"
         if self.mode in ("rgb", "alpha"):
             write_rgb(path, image if self.mode == "rgb" else image[..., None].expand(-1, -1, 3))
             return [str(path)]
-        numbers = self.out / f"{stem}.npy"
+        numbers = path.with_suffix(".npy")
         with atomic_path(numbers) as temporary:
             np.save(temporary, image.numpy())
         write_rgb(path, depth_picture(image))

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Literal
 
 from sgwarp.commands.options import SemanticsOptions, check_folder, find_views, photograph
 from sgwarp.errors import InputError
@@ -33,8 +33,11 @@ class Segment(SemanticsOptions):
     view: str | None = None
     """Only the view of this name."""
 
-    temperature: float = 0.1
-    """Of the softmax over the classes, per Gaussian."""
+    scoring: Literal["evidence", "cosine"] = "cosine"
+    """"cosine" gives every pixel one of the classes, so name all there are; "evidence" leaves what fits none unknown."""
+
+    temperature: float | None = None
+    """Of the softmax over the classes, per Gaussian; 0.3 for evidence and 0.1 for cosine if not given."""
 
     unknown_below: float = 0.0
     """Pixels whose best class has a smaller confidence are unknown, 0 to 1."""
@@ -54,7 +57,7 @@ class Segment(SemanticsOptions):
                 with log.stage("load_encoder"):
                     encoder = text_encoder_for(semantics.space)
             with log.stage("query"):
-                votes = class_votes(semantics, classes, encoder, self.temperature)
+                votes = class_votes(semantics, classes, encoder, self.temperature, self.scoring)
             lifted = semantics if classes is None else None
             unknown = 0.0
             with show_progress("segment") as progress:

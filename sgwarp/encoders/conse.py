@@ -39,7 +39,7 @@ class ConseSettings:
         dense_cell: Pixels per cell of the map in mode "dense".
     """
 
-    map_sides: tuple[int, ...] = (480, 960)
+    map_sides: tuple[int, ...] = (480,)
     side: int = 480
     scales: tuple[float, ...] = (300.0,)
     smallest: int = 60

@@ -1,6 +1,7 @@
 """The command line in this process: files in, files and exit codes out."""
 
 import json
+import shutil
 import sys
 
 import cv2
@@ -157,6 +158,25 @@ def test_render_views(stage, stage_files, tmp_path):
     drawn = cv2.imread(str(tmp_path / "0002.png"))[..., ::-1]
     photograph = cv2.imread(str(stage_files.views / "images" / "0002.png"))[..., ::-1]
     assert np.median(np.abs(drawn.astype(int) - photograph)) < 8
+
+
+def test_render_one_view_to_a_named_file(stage_files, tmp_path, capsys):
+    arguments = ["render", stage_files.scene, "--views", stage_files.views, "--out", tmp_path / "picture.png"]
+    assert main([*map(str, arguments), "--view", "0001"]) == 0
+    assert sorted(p.name for p in tmp_path.iterdir()) == ["picture.png", "run.json"]
+    capsys.readouterr()
+    assert "one file for 6 views" in fails(capsys, *arguments)
+
+
+def test_render_takes_sizes_from_the_photographs_if_need_be(stage, stage_files, tmp_path):
+    views = tmp_path / "views"
+    shutil.copytree(stage_files.views, views)
+    meta = json.loads((views / "transforms.json").read_text())
+    del meta["w"], meta["h"]
+    (views / "transforms.json").write_text(json.dumps(meta))
+    out = tmp_path / "out"
+    assert main(["render", str(stage_files.scene), "--views", str(views), "--view", "0001", "--out", str(out)]) == 0
+    assert cv2.imread(str(out / "0001.png")).shape[:2] == stage.views[1].camera.size
 
 
 def test_render_without_views_turns_around_the_scene(stage_files, tmp_path):

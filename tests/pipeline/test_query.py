@@ -107,6 +107,23 @@ def test_votes_of_unseen_gaussians_are_zero(random_semantics):
     torch.testing.assert_close(votes[seen].sum(dim=1), torch.ones(199))
 
 
+def test_standardised_votes_silence_a_loud_class():
+    """All features lean towards the first class, half of them less: those go to the second one."""
+    features = torch.tensor([[0.9, 0.1], [0.8, 0.3]]).repeat(10, 1)
+    semantics = semantics_of(features)
+
+    class Axes:
+        space = "toy"
+
+        def encode_text(self, texts):
+            return torch.eye(2)[: len(texts)]
+
+    plain = class_votes(semantics, ["a", "b"], Axes()).argmax(dim=1)
+    fair = class_votes(semantics, ["a", "b"], Axes(), scoring="evidence").argmax(dim=1)
+    assert plain.tolist() == [0, 0] * 10
+    assert fair.tolist() == [0, 1] * 10
+
+
 def test_votes_of_lifted_labels_are_their_shares():
     shares = torch.tensor([[0.2, 0.8, 0.0], [1.0, 0.0, 0.0]])
     lifted = semantics_of(shares.half(), space="labels", labels=("sofa", "cup", "lamp"))

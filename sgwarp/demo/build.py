@@ -1,0 +1,104 @@
+"""Make the data of the demonstration from the full data set of the room: `python -m sgwarp.demo.build`.
+
+Reads the folder `room` below $SGWARP_DATA: 60 rendered views with depth and label images, every eighth of them held
+out. The scene is made from the RGB-D of the others; a dozen of these and two held-out views are shipped.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from sgwarp.demo.data import CLASSES_FILE, FURNITURE, HELD_OUT, ROOM, SCENE_FILE
+from sgwarp.errors import InputError
+from sgwarp.from_depth import gaussians_from_depth
+from sgwarp.io.atomic import atomic_path
+from sgwarp.io.images import read_ids, write_ids, write_rgb
+from sgwarp.io.scenes import save_gaussians
+from sgwarp.io.views import load_views
+from sgwarp.progress import show_progress
+from sgwarp.scene import View
+
+COUNT = 150_000  # Gaussians, 16 bytes each
+VIEWS = 12
+HOLD_OUT = 8  # every eighth view is held out
+SHOWN = ("0016", "0024")  # held-out views that are shipped: between them they show every object
+NEAR, SIMILAR = 0.5, 25.0  # of two views this close [m] that look the same way [degrees], one is enough
+
+
+def build_room(source: Path, out: Path) -> None:
+    """Write the scene, the posed photographs and the label images.
+
+    Args:
+        source: Folder with transforms.json, images/, depth/ (uint16 millimetres), labels/ and classes.json.
+        out: Folder to write into.
+
+    Raises:
+        InputError: Something is missing in `source`.
+    """
+    views = load_views(source)
+    train = [view for index, view in enumerate(views) if index % HOLD_OUT]
+    held_out = [view for view in views[::HOLD_OUT] if view.stem in SHOWN]
+
+    def depth(view: View) -> NDArray[np.float32]:
+        return read_ids(source / "depth" / f"{view.stem}.png").astype(np.float32) * np.float32(0.001)
+
+    with show_progress("gaussians") as progress:
+        gaussians = gaussians_from_depth(train, depth, count=COUNT, progress=progress)
+    save_gaussians(gaussians, out / SCENE_FILE)
+    labels = {view.stem: read_ids(source / "labels" / f"{view.stem}.png") for view in views}
+    lifted = choose_views(train, [labels[view.stem] for view in train], VIEWS)
+    meta = json.loads((source / "transforms.json").read_text(encoding="utf-8"))
+    _write_views(lifted, labels, meta, out)
+    _write_views(held_out, labels, meta, out / HELD_OUT)
+    names = json.loads((source / "classes.json").read_text(encoding="utf-8"))
+    _write_json(out / CLASSES_FILE, names)
+    print(f"{out}: {len(gaussians)} Gaussians, views {' '.join(view.stem for view in lifted)}")
+
+
+def choose_views(views: Sequence[View], labels: Sequence[NDArray[np.int32]], count: int) -> list[View]:
+    """Greedily choose views from different places that show every furniture class often and large, in their order."""
+    pixels = np.stack([np.bincount(image.ravel(), minlength=FURNITURE + 1)[1 : FURNITURE + 1] for image in labels])
+    shown = pixels / pixels.max(axis=0).clip(min=1)
+    places = np.stack([view.camera.position.numpy() for view in views])
+    forward = np.stack([view.camera.world_to_camera[2, :3].numpy() for view in views])
+    apart = np.linalg.norm(places[:, None] - places, axis=2) > NEAR
+    different = (forward @ forward.T < np.cos(np.radians(SIMILAR))) | apart
+    chosen: list[int] = []
+    while len(chosen) < count:
+        open_ = [k for k in range(len(views)) if k not in chosen and different[k, chosen].all()]
+        if not open_:
+            raise InputError(f"only {len(chosen)} of {count} views are different enough")
+        # The logarithm makes the class that has been shown least count most.
+        gains = [np.log(0.2 + shown[[*chosen, k]].sum(axis=0)).sum() for k in open_]
+        chosen.append(open_[int(np.argmax(gains))])
+    return [views[k] for k in sorted(chosen)]
+
+
+def _write_views(views: Sequence[View], labels: dict[str, NDArray[np.int32]], meta: dict[str, Any], out: Path) -> None:
+    poses = {Path(frame["file_path"]).stem: frame["transform_matrix"] for frame in meta["frames"]}
+    frames = []
+    for view in views:
+        name = f"images/{view.stem}.jpg"
+        write_rgb(out / name, view.image())
+        write_ids(out / "labels" / f"{view.stem}.png", labels[view.stem].astype(np.uint8))
+        frames.append({"file_path": name, "transform_matrix": poses[view.stem]})
+    _write_json(out / "transforms.json", {**meta, "frames": frames})
+
+
+def _write_json(path: Path, content: Any) -> None:
+    with atomic_path(path) as temporary:
+        temporary.write_text(json.dumps(content, indent=1) + "\n", encoding="utf-8")
+
+
+if __name__ == "__main__":
+    data = os.environ.get("SGWARP_DATA")
+    if data is None:
+        raise SystemExit("set SGWARP_DATA to the folder that holds room/")
+    build_room(Path(data) / "room", ROOM)
