@@ -85,6 +85,8 @@ sys.modules[__name__].__class__ = _Package
 
 
 def __getattr__(name: str) -> Any:
+    if name == "compat":  # a package of facades, not a name of its own
+        return import_module("sgwarp.compat")
     if name not in _HOME:
         raise AttributeError(f"module 'sgwarp' has no attribute '{name}'")
     value = getattr(import_module(_HOME[name]), name)

@@ -34,7 +34,7 @@ class Segment(SemanticsOptions):
     """Only the view of this name."""
 
     scoring: Literal["evidence", "cosine"] = "cosine"
-    """"cosine" gives every pixel one of the classes, so name all there are; "evidence" leaves what fits none unknown."""
+    """"cosine" gives every pixel one of the classes, so name all; "evidence" leaves what fits none of them unknown."""
 
     temperature: float | None = None
     """Of the softmax over the classes, per Gaussian; 0.3 for evidence and 0.1 for cosine if not given."""

@@ -65,7 +65,7 @@ class FileMaps:
         self.levels = levels
         if not self.folder.is_dir():
             raise InputError(f"{self.folder}: no such folder; give the one that holds a file per view")
-        found = [(view, *self._find(view.stem)) for view in views if self._has(view.stem)]
+        found = [(view, *self._find(view.stem)) for view in views if self.has_map(view)]
         if not found:
             names = ", ".join(f"{{stem}}{suffix}" for suffix in (".png", *FEATURE_SUFFIXES, "_s.npy"))
             raise InputError(f"{self.folder}: holds no map of any of the {len(views)} views; looked for {names}")
@@ -98,8 +98,9 @@ class FileMaps:
         files = [(kind, self.folder / f"{stem}{suffix}") for kind, suffix in kinds]
         return [(kind, path) for kind, path in files if path.is_file()]
 
-    def _has(self, stem: str) -> bool:
-        return bool(self._candidates(stem))
+    def has_map(self, view: View) -> bool:
+        """Whether the folder holds a file for the view; it is not opened."""
+        return bool(self._candidates(view.stem))
 
     def _find(self, stem: str) -> tuple[Kind, Path]:
         """What kind of map a view has, and its (first) file."""

@@ -33,7 +33,9 @@ def atomic_path(path: str | os.PathLike[str]) -> Iterator[Path]:
     except OSError as error:
         raise InputError(f"{target}: cannot be written ({error.strerror or error}); choose another folder") from None
     try:
+        wanted = temporary.stat().st_mode
         yield temporary
+        temporary.chmod(wanted)  # some writers replace the file by one that only its owner may read
         os.replace(temporary, target)
     finally:
         temporary.unlink(missing_ok=True)

@@ -12,7 +12,7 @@ import pytest
 import warp as wp
 
 import sgwarp.kernels
-from sgwarp.kernels import compositing_block, lifting_block
+from sgwarp.kernels import compositing_block, lifting_block, pixel_lists
 from sgwarp.ops import launch  # noqa: F401 - starts Warp quietly
 
 ARCHITECTURES = (80, 86, 89, 90)
@@ -31,6 +31,7 @@ def cuda_kernels() -> list[wp.Kernel]:
         kernels.append(compositing_block.make_composite_colors_block(flag))
         kernels.append(lifting_block.make_lift_dense_block(flag))
         kernels.append(lifting_block.make_lift_ids_block(flag))
+        kernels.append(pixel_lists.make_list_contributors(flag))
     kernels.append(compositing_block.make_composite_features_block())
     return kernels
 
@@ -38,7 +39,13 @@ def cuda_kernels() -> list[wp.Kernel]:
 def test_the_list_of_kernels_is_complete():
     names = {kernel.key.split("__locals__")[-1] for kernel in cuda_kernels()}
     assert {"project_gaussians", "evaluate_harmonics", "pack_fragments", "sum_rows", "find_center_pixels"} <= names
-    factories = {"composite_colors_block", "composite_features_block", "lift_dense_block", "lift_ids_block"}
+    factories = {
+        "list_contributors",
+        "composite_colors_block",
+        "composite_features_block",
+        "lift_dense_block",
+        "lift_ids_block",
+    }
     assert factories <= names
 
 
