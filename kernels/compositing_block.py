@@ -29,8 +29,57 @@ def alpha_at(f: Fragment, column: int, row: int, knobs: Knobs) -> float:
 
 
 @cache
+def pixel_walk(depth: bool, record: bool) -> wp.Function:
+    """Device function that composites the three packed channels of one pixel per thread.
+
+    It returns transmittance, colour, sum of alpha T z, the fragment that is the surface (-1 = none) and the last
+    contributing fragment (with `record`), both counted from the tile's first.
+    """
+
+    @wp.func
+    def walk(
+        tile: int,
+        column: int,
+        row: int,
+        inside: bool,
+        offsets: wp.array[int],
+        fragments: wp.array[Fragment],
+        knobs: Knobs,
+    ):
+        T = wp.where(inside, 1.0, 0.0)
+        color = wp.vec3(0.0, 0.0, 0.0)
+        depth_sum = float(0.0)
+        surface = int(-1)
+        latest = int(-1)
+        first = offsets[tile]
+        stop = offsets[tile + 1]
+        for start in range(first, stop, STAGE):
+            staged = wp.tile_load(fragments, shape=STAGE, offset=start, storage="shared")
+            for j in range(wp.min(STAGE, stop - start)):
+                f = staged[j]
+                alpha = alpha_at(f, column, row, knobs)
+                w = contribution(alpha, T, knobs)
+                color += w * f.color
+                if wp.static(record):
+                    latest = wp.where(w > 0.0, start - first + j, latest)
+                if wp.static(depth):
+                    depth_sum += w * f.depth
+                    behind = T - w
+                    if T > knobs.surface_transmittance and behind <= knobs.surface_transmittance:
+                        surface = start - first + j
+                T = attenuated(alpha, T, knobs)
+            open_pixels = wp.tile_sum(wp.tile(wp.where(T > 0.0, 1, 0)))
+            if open_pixels[0] == 0:
+                break
+        return T, color, depth_sum, surface, latest
+
+    return walk
+
+
+@cache
 def make_composite_colors_block(depth: bool) -> wp.Kernel:
     """Block-schedule counterpart of `make_composite_colors`."""
+    walk = pixel_walk(depth, False)
 
     @wp.kernel(module="unique", module_options=BLOCK_OPTIONS, enable_backward=False)
     def composite_colors_block(
@@ -54,40 +103,121 @@ def make_composite_colors_block(depth: bool) -> wp.Kernel:
         x = (tile % columns) * TILE + column
         y = (tile / columns) * TILE + row
         inside = x < width and y < height
-        T = wp.where(inside, 1.0, 0.0)
-        color = wp.vec3(0.0, 0.0, 0.0)
-        depth_sum = float(0.0)
-        surface = float(0.0)
-        last = offsets[tile + 1]
-        for start in range(offsets[tile], last, STAGE):
-            staged = wp.tile_load(fragments, shape=STAGE, offset=start, storage="shared")
-            for j in range(wp.min(STAGE, last - start)):
-                f = staged[j]
-                alpha = alpha_at(f, column, row, knobs)
-                w = contribution(alpha, T, knobs)
-                color += w * f.color
-                if wp.static(depth):
-                    depth_sum += w * f.depth
-                    behind = T - alpha * T
-                    if T > knobs.surface_transmittance and behind <= knobs.surface_transmittance:
-                        surface = f.depth
-                T = attenuated(alpha, T, knobs)
-            open_pixels = wp.tile_sum(wp.tile(wp.where(T > 0.0, 1, 0)))
-            if open_pixels[0] == 0:
-                break
+        T, color, depth_sum, surface, _latest = walk(tile, column, row, inside, offsets, fragments, knobs)
         if inside:
             colors_out[y, x] = color
             transmittance_out[y, x] = wp.abs(T)
             if wp.static(depth):
                 depth_sum_out[y, x] = depth_sum
-                surface_out[y, x] = surface
+                d = float(0.0)
+                if surface >= 0:
+                    d = fragments[offsets[tile] + surface].depth
+                surface_out[y, x] = d
 
     return composite_colors_block
 
 
 @cache
+def make_record_colors_block(depth: bool) -> wp.Kernel:
+    """Block-schedule counterpart of `make_record_colors`."""
+    walk = pixel_walk(depth, True)
+
+    @wp.kernel(module="unique", module_options=BLOCK_OPTIONS, enable_backward=False)
+    def record_colors_block(
+        # In:
+        offsets: wp.array[int],  # [tiles + 1]
+        fragments: wp.array[Fragment],  # [I]
+        knobs: Knobs,
+        width: int,
+        height: int,
+        # Out:
+        colors_out: wp.array2d[wp.vec3],  # [H, W] sum of alpha T color
+        transmittance_out: wp.array2d[float],  # [H, W]
+        depth_sum_out: wp.array2d[float],  # [H, W] sum of alpha T z [m]
+        surface_out: wp.array2d[float],  # [H, W] z where accumulated opacity passes alpha_d [m], 0 = no hit
+        last_out: wp.array2d[int],  # [H, W] last contributing fragment, counted from its tile's first, -1 = none
+        hit_out: wp.array2d[int],  # [H, W] Gaussian of `surface_out`, -1 = no hit
+    ):
+        """Paper eq. 1; one block per tile."""
+        tile, t = wp.tid()
+        columns = (width + TILE - 1) / TILE
+        column = t % TILE
+        row = t / TILE
+        x = (tile % columns) * TILE + column
+        y = (tile / columns) * TILE + row
+        inside = x < width and y < height
+        T, color, depth_sum, surface, latest = walk(tile, column, row, inside, offsets, fragments, knobs)
+        if inside:
+            colors_out[y, x] = color
+            transmittance_out[y, x] = wp.abs(T)
+            last_out[y, x] = latest
+            if wp.static(depth):
+                depth_sum_out[y, x] = depth_sum
+                d = float(0.0)
+                hit = int(-1)
+                if surface >= 0:
+                    d = fragments[offsets[tile] + surface].depth
+                    hit = fragments[offsets[tile] + surface].gaussian
+                surface_out[y, x] = d
+                hit_out[y, x] = hit
+
+    return record_colors_block
+
+
+@cache
+def feature_pixel_walk(record: bool) -> wp.Function:
+    """Device function that composites 16 channels of one pixel per thread.
+
+    It returns transmittance, channels and, with `record`, the last contributing fragment counted from the tile's first.
+    """
+
+    @wp.func
+    def walk(
+        tile: int,
+        s: int,
+        column: int,
+        row: int,
+        inside: bool,
+        offsets: wp.array[int],
+        fragments: wp.array[Fragment],
+        features: wp.array2d[Lanes],
+        knobs: Knobs,
+    ):
+        T = wp.where(inside, 1.0, 0.0)
+        total = Lanes(0.0)
+        latest = int(-1)
+        first = offsets[tile]
+        stop = offsets[tile + 1]
+        for start in range(first, stop, STAGE):
+            staged = wp.tile_load(fragments, shape=STAGE, offset=start, storage="shared")
+            for j in range(wp.min(STAGE, stop - start)):
+                f = staged[j]
+                alpha = alpha_at(f, column, row, knobs)
+                w = contribution(alpha, T, knobs)
+                if w > 0.0:
+                    total += w * features[f.gaussian, s]
+                    if wp.static(record):
+                        latest = start - first + j
+                T = attenuated(alpha, T, knobs)
+            open_pixels = wp.tile_sum(wp.tile(wp.where(T > 0.0, 1, 0)))
+            if open_pixels[0] == 0:
+                break
+        return T, total, latest
+
+    return walk
+
+
+@wp.func
+def write_channels(total: Lanes, y: int, x: int, s: int, features_out: wp.array3d[float]):
+    for c in range(LANES):
+        if s * LANES + c < features_out.shape[2]:
+            features_out[y, x, s * LANES + c] = total[c]
+
+
+@cache
 def make_composite_features_block() -> wp.Kernel:
     """Block-schedule counterpart of `make_composite_features`; every block composites 16 channels of a tile."""
+    walk = feature_pixel_walk(False)
 
     @wp.kernel(module="unique", module_options=BLOCK_OPTIONS, enable_backward=False)
     def composite_features_block(
@@ -110,26 +240,47 @@ def make_composite_features_block() -> wp.Kernel:
         x = (tile % columns) * TILE + column
         y = (tile / columns) * TILE + row
         inside = x < width and y < height
-        T = wp.where(inside, 1.0, 0.0)
-        total = Lanes(0.0)
-        last = offsets[tile + 1]
-        for start in range(offsets[tile], last, STAGE):
-            staged = wp.tile_load(fragments, shape=STAGE, offset=start, storage="shared")
-            for j in range(wp.min(STAGE, last - start)):
-                f = staged[j]
-                alpha = alpha_at(f, column, row, knobs)
-                w = contribution(alpha, T, knobs)
-                if w > 0.0:
-                    total += w * features[f.gaussian, s]
-                T = attenuated(alpha, T, knobs)
-            open_pixels = wp.tile_sum(wp.tile(wp.where(T > 0.0, 1, 0)))
-            if open_pixels[0] == 0:
-                break
+        T, total, _latest = walk(tile, s, column, row, inside, offsets, fragments, features, knobs)
         if inside:
-            for c in range(LANES):
-                if s * LANES + c < features_out.shape[2]:
-                    features_out[y, x, s * LANES + c] = total[c]
+            write_channels(total, y, x, s, features_out)
             if s == 0:
                 transmittance_out[y, x] = wp.abs(T)
 
     return composite_features_block
+
+
+@cache
+def make_record_features_block() -> wp.Kernel:
+    """Block-schedule counterpart of `make_record_features`."""
+    walk = feature_pixel_walk(True)
+
+    @wp.kernel(module="unique", module_options=BLOCK_OPTIONS, enable_backward=False)
+    def record_features_block(
+        # In:
+        offsets: wp.array[int],  # [tiles + 1]
+        fragments: wp.array[Fragment],  # [I]
+        features: wp.array2d[Lanes],  # [N, S] channels in slices of 16
+        knobs: Knobs,
+        width: int,
+        height: int,
+        # Out:
+        features_out: wp.array3d[float],  # [H, W, C] sum of alpha T x
+        transmittance_out: wp.array2d[float],  # [H, W]
+        last_out: wp.array2d[int],  # [H, W] last contributing fragment, counted from its tile's first, -1 = none
+    ):
+        """Paper eq. 1 for any number of channels; one block per (tile, slice)."""
+        tile, s, t = wp.tid()
+        columns = (width + TILE - 1) / TILE
+        column = t % TILE
+        row = t / TILE
+        x = (tile % columns) * TILE + column
+        y = (tile / columns) * TILE + row
+        inside = x < width and y < height
+        T, total, latest = walk(tile, s, column, row, inside, offsets, fragments, features, knobs)
+        if inside:
+            write_channels(total, y, x, s, features_out)
+            if s == 0:
+                transmittance_out[y, x] = wp.abs(T)
+                last_out[y, x] = latest
+
+    return record_features_block

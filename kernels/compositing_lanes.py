@@ -94,9 +94,112 @@ def still_open(mask: int, state: wp.array3d[Lanes], slot: int) -> int:
 
 
 @cache
+def color_walk(depth: bool, record: bool) -> wp.Function:
+    """Device function that composites a tile's three packed channels into its scratch.
+
+    Planes of the scratch: transmittance, three channels, with `depth` sum of alpha T z and the surface depth, with
+    `record` the last contributing fragment. With both, the surface is kept as a fragment, not as a depth.
+    """
+    planes = color_planes(depth, record)
+
+    @wp.func
+    def walk(
+        tile: int,
+        slot: int,
+        offsets: wp.array[int],
+        fragments: wp.array[Fragment],
+        knobs: Knobs,
+        width: int,
+        height: int,
+        state: wp.array3d[Lanes],
+    ):
+        columns = (width + TILE - 1) / TILE
+        x0 = (tile % columns) * TILE
+        y0 = (tile / columns) * TILE
+        for row in range(TILE):
+            state[slot, row, 0] = open_lanes(x0, width)
+            for plane in range(1, planes):
+                state[slot, row, plane] = Lanes(0.0)
+            if wp.static(record):
+                state[slot, row, wp.static(planes - 1)] = Lanes(-1.0)
+                if wp.static(depth):
+                    state[slot, row, 5] = Lanes(-1.0)
+        open_rows = open_row_mask(y0, height)
+        first = offsets[tile]
+        for k in range(first, offsets[tile + 1]):
+            f = fragments[k]
+            for row in range(f.first_row, f.last_row + 1):
+                if row_is_reached(f, row, knobs) and (open_rows >> row) & 1 != 0:
+                    T = state[slot, row, 0]
+                    alphas = lane_alphas(f, row, knobs)
+                    w = lane_contributions(alphas, T, knobs)
+                    state[slot, row, 0] = lane_attenuated(alphas, T, knobs)
+                    state[slot, row, 1] = state[slot, row, 1] + w * f.color[0]
+                    state[slot, row, 2] = state[slot, row, 2] + w * f.color[1]
+                    state[slot, row, 3] = state[slot, row, 3] + w * f.color[2]
+                    if wp.static(record):
+                        state[slot, row, wp.static(planes - 1)] = latest(
+                            w, float(k - first), state[slot, row, wp.static(planes - 1)]
+                        )
+                    if wp.static(depth):
+                        state[slot, row, 4] = state[slot, row, 4] + w * f.depth
+                        surface = state[slot, row, 5]
+                        found = f.depth
+                        if wp.static(record):
+                            found = float(k - first)
+                        for i in range(LANES):
+                            behind = T[i] - w[i]
+                            here = wp.where(behind <= knobs.surface_transmittance, found, surface[i])
+                            surface[i] = wp.where(T[i] > knobs.surface_transmittance, here, surface[i])
+                        state[slot, row, 5] = surface
+            if (k - first) % CLOSE_EVERY == CLOSE_EVERY - 1:
+                open_rows = still_open(open_rows, state, slot)
+                if open_rows == 0:
+                    break
+
+    return walk
+
+
+def color_planes(depth: bool, record: bool) -> int:
+    """Scratch vectors per row that compositing colours needs."""
+    return (6 if depth else 4) + int(record)
+
+
+@wp.func
+def latest(w: Lanes, k: float, last: Lanes) -> Lanes:
+    """k in the lanes to which its fragment contributes. Floats count exactly to 2^24 fragments of one tile."""
+    newest = last
+    for i in range(LANES):
+        newest[i] = wp.where(w[i] > 0.0, k, last[i])
+    return newest
+
+
+@wp.func
+def write_colors(
+    slot: int,
+    x0: int,
+    y0: int,
+    width: int,
+    height: int,
+    state: wp.array3d[Lanes],
+    colors_out: wp.array2d[wp.vec3],
+    transmittance_out: wp.array2d[float],
+):
+    """Colours and transmittance of a tile, from lanes to pixels."""
+    for row in range(wp.min(TILE, height - y0)):
+        T = state[slot, row, 0]
+        r = state[slot, row, 1]
+        g = state[slot, row, 2]
+        b = state[slot, row, 3]
+        for i in range(wp.min(LANES, width - x0)):
+            colors_out[y0 + row, x0 + i] = wp.vec3(r[i], g[i], b[i])
+            transmittance_out[y0 + row, x0 + i] = wp.abs(T[i])
+
+
+@cache
 def make_composite_colors(depth: bool) -> wp.Kernel:
     """Kernel that composites three packed channels; with `depth` also sum of alpha T z and the surface depth."""
-    planes = 6 if depth else 4
+    walk = color_walk(depth, False)
 
     @wp.kernel(module="unique", module_options=LANE_OPTIONS, enable_backward=False)
     def composite_colors(
@@ -120,44 +223,10 @@ def make_composite_colors(depth: bool) -> wp.Kernel:
         columns = (width + TILE - 1) / TILE
         x0 = (tile % columns) * TILE
         y0 = (tile / columns) * TILE
-        for row in range(TILE):
-            state[slot, row, 0] = open_lanes(x0, width)
-            for plane in range(1, planes):
-                state[slot, row, plane] = Lanes(0.0)
-        open_rows = open_row_mask(y0, height)
-        first = offsets[tile]
-        for k in range(first, offsets[tile + 1]):
-            f = fragments[k]
-            for row in range(f.first_row, f.last_row + 1):
-                if row_is_reached(f, row, knobs) and (open_rows >> row) & 1 != 0:
-                    T = state[slot, row, 0]
-                    alphas = lane_alphas(f, row, knobs)
-                    w = lane_contributions(alphas, T, knobs)
-                    state[slot, row, 0] = lane_attenuated(alphas, T, knobs)
-                    state[slot, row, 1] = state[slot, row, 1] + w * f.color[0]
-                    state[slot, row, 2] = state[slot, row, 2] + w * f.color[1]
-                    state[slot, row, 3] = state[slot, row, 3] + w * f.color[2]
-                    if wp.static(depth):
-                        state[slot, row, 4] = state[slot, row, 4] + w * f.depth
-                        surface = state[slot, row, 5]
-                        for i in range(LANES):
-                            behind = T[i] - alphas[i] * T[i]
-                            here = wp.where(behind <= knobs.surface_transmittance, f.depth, surface[i])
-                            surface[i] = wp.where(T[i] > knobs.surface_transmittance, here, surface[i])
-                        state[slot, row, 5] = surface
-            if (k - first) % CLOSE_EVERY == CLOSE_EVERY - 1:
-                open_rows = still_open(open_rows, state, slot)
-                if open_rows == 0:
-                    break
-        for row in range(wp.min(TILE, height - y0)):
-            T = state[slot, row, 0]
-            r = state[slot, row, 1]
-            g = state[slot, row, 2]
-            b = state[slot, row, 3]
-            for i in range(wp.min(LANES, width - x0)):
-                colors_out[y0 + row, x0 + i] = wp.vec3(r[i], g[i], b[i])
-                transmittance_out[y0 + row, x0 + i] = wp.abs(T[i])
-            if wp.static(depth):
+        walk(tile, slot, offsets, fragments, knobs, width, height, state)
+        write_colors(slot, x0, y0, width, height, state, colors_out, transmittance_out)
+        if wp.static(depth):
+            for row in range(wp.min(TILE, height - y0)):
                 z = state[slot, row, 4]
                 surface = state[slot, row, 5]
                 for i in range(wp.min(LANES, width - x0)):
@@ -198,8 +267,103 @@ def add_products(
 
 
 @cache
+def feature_walk(slices: int, record: bool) -> wp.Function:
+    """Device function that composites 16 `slices` channels of a tile into its scratch.
+
+    Planes of the scratch: transmittance, the channels, with `record` the last contributing fragment.
+    """
+    last_plane = 1 + PASS * slices
+
+    @wp.func
+    def walk(
+        tile: int,
+        slot: int,
+        offsets: wp.array[int],
+        fragments: wp.array[Fragment],
+        features: wp.array3d[Lanes],
+        first_slice: int,
+        knobs: Knobs,
+        width: int,
+        height: int,
+        state: wp.array3d[Lanes],
+        weights: wp.array3d[Lanes],
+        owners: wp.array3d[int],
+    ):
+        columns = (width + TILE - 1) / TILE
+        x0 = (tile % columns) * TILE
+        y0 = (tile / columns) * TILE
+        rows = wp.min(TILE, height - y0)
+        for row in range(rows):
+            state[slot, row, 0] = open_lanes(x0, width)
+            for plane in range(1, wp.static(1 + PASS * slices)):
+                state[slot, row, plane] = Lanes(0.0)
+            if wp.static(record):
+                state[slot, row, last_plane] = Lanes(-1.0)
+        open_rows = open_row_mask(y0, height)
+        first = offsets[tile]
+        stop = offsets[tile + 1]
+        for start in range(first, stop, BATCH):
+            end = wp.min(start + BATCH, stop)
+            for row in range(rows):
+                if (open_rows >> row) & 1 != 0:
+                    count = int(0)
+                    T = state[slot, row, 0]
+                    for k in range(start, end):
+                        f = fragments[k]
+                        if row_is_reached(f, row, knobs):
+                            alphas = lane_alphas(f, row, knobs)
+                            w = lane_contributions(alphas, T, knobs)
+                            weights[slot, row, count] = w
+                            owners[slot, row, count] = f.gaussian
+                            T = lane_attenuated(alphas, T, knobs)
+                            count += 1
+                            if wp.static(record):
+                                state[slot, row, last_plane] = latest(w, float(k - first), state[slot, row, last_plane])
+                    state[slot, row, 0] = T
+                    for s in range(wp.static(slices)):
+                        add_products(weights, owners, slot, row, count, features, first_slice + s, state, 1 + PASS * s)
+            open_rows = still_open(open_rows, state, slot)
+            if open_rows == 0:
+                break
+
+    return walk
+
+
+@cache
+def feature_writer(slices: int) -> wp.Function:
+    """Device function that writes what `feature_walk` left in the scratch."""
+
+    @wp.func
+    def write(
+        slot: int,
+        x0: int,
+        y0: int,
+        first_slice: int,
+        width: int,
+        height: int,
+        state: wp.array3d[Lanes],
+        features_out: wp.array3d[float],
+        transmittance_out: wp.array2d[float],
+    ):
+        inside = wp.min(LANES, width - x0)
+        channels = features_out.shape[2]
+        for row in range(wp.min(TILE, height - y0)):
+            T = state[slot, row, 0]
+            for i in range(inside):
+                transmittance_out[y0 + row, x0 + i] = wp.abs(T[i])
+            for c in range(wp.min(wp.static(PASS * slices), channels - PASS * first_slice)):
+                values = state[slot, row, 1 + c]
+                for i in range(inside):
+                    features_out[y0 + row, x0 + i, PASS * first_slice + c] = values[i]
+
+    return write
+
+
+@cache
 def make_composite_features(slices: int) -> wp.Kernel:
     """Kernel that composites passes of `16 slices` channels."""
+    walk = feature_walk(slices, False)
+    write = feature_writer(slices)
 
     @wp.kernel(module="unique", module_options=LANE_OPTIONS, enable_backward=False)
     def composite_features(
@@ -225,42 +389,7 @@ def make_composite_features(slices: int) -> wp.Kernel:
         columns = (width + TILE - 1) / TILE
         x0 = (tile % columns) * TILE
         y0 = (tile / columns) * TILE
-        rows = wp.min(TILE, height - y0)
-        inside = wp.min(LANES, width - x0)
-        for row in range(rows):
-            state[slot, row, 0] = open_lanes(x0, width)
-            for plane in range(1, wp.static(1 + 16 * slices)):
-                state[slot, row, plane] = Lanes(0.0)
-        open_rows = open_row_mask(y0, height)
-        last = offsets[tile + 1]
-        for start in range(offsets[tile], last, BATCH):
-            stop = wp.min(start + BATCH, last)
-            for row in range(rows):
-                if (open_rows >> row) & 1 != 0:
-                    count = int(0)
-                    T = state[slot, row, 0]
-                    for k in range(start, stop):
-                        f = fragments[k]
-                        if row_is_reached(f, row, knobs):
-                            alphas = lane_alphas(f, row, knobs)
-                            weights[slot, row, count] = lane_contributions(alphas, T, knobs)
-                            owners[slot, row, count] = f.gaussian
-                            T = lane_attenuated(alphas, T, knobs)
-                            count += 1
-                    state[slot, row, 0] = T
-                    for s in range(wp.static(slices)):
-                        add_products(weights, owners, slot, row, count, features, first_slice + s, state, 1 + PASS * s)
-            open_rows = still_open(open_rows, state, slot)
-            if open_rows == 0:
-                break
-        channels = features_out.shape[2]
-        for row in range(rows):
-            T = state[slot, row, 0]
-            for i in range(inside):
-                transmittance_out[y0 + row, x0 + i] = wp.abs(T[i])
-            for c in range(wp.min(wp.static(PASS * slices), channels - PASS * first_slice)):
-                values = state[slot, row, 1 + c]
-                for i in range(inside):
-                    features_out[y0 + row, x0 + i, PASS * first_slice + c] = values[i]
+        walk(tile, slot, offsets, fragments, features, first_slice, knobs, width, height, state, weights, owners)
+        write(slot, x0, y0, first_slice, width, height, state, features_out, transmittance_out)
 
     return composite_features

@@ -9,7 +9,7 @@ import warp as wp
 from torch import Tensor
 
 from sgwarp.errors import InputError
-from sgwarp.kernels import compositing_block, compositing_lanes
+from sgwarp.kernels import compositing_block, compositing_lanes, compositing_lanes_record
 from sgwarp.kernels.transmittance import Lanes
 from sgwarp.ops import tiles
 from sgwarp.ops.launch import get_threads, launch, launch_blocks, scratch, view
@@ -74,7 +74,7 @@ def rasterize(
 
     projected = tiles.project(gaussians, camera, settings)
     order = tiles.depth_order(projected)
-    colors = _packed_colors(gaussians, camera, features, order, settings)
+    colors = packed_colors(gaussians, camera, features, order, settings)
     lists = tiles.bin_splats(projected, order, colors, camera, settings)
     wants_depth = expected_depth or depth
     image, transmittance, depth_sum, surface = composite(lists, camera, settings, features, wants_depth)
@@ -87,7 +87,7 @@ def rasterize(
     return Rendering(image, alpha, mean_depth, surface if depth else None, projected.culled())
 
 
-def _packed_colors(
+def packed_colors(
     gaussians: Gaussians, camera: Camera, features: Tensor | None, order: Tensor, settings: RasterSettings
 ) -> Tensor | None:
     """Colours by depth order. Three channels travel with the fragments; more are gathered while compositing."""
@@ -112,8 +112,45 @@ def composite(
 
     `schedule` is "lanes" or "block", by default the device's own; either runs on the CPU.
     """
+    return _composite(lists, camera, settings, features, wants_depth, schedule, None, None)
+
+
+def composite_recorded(
+    lists: tiles.TileLists,
+    camera: Camera,
+    settings: RasterSettings,
+    features: Tensor | None,
+    wants_depth: bool,
+    schedule: str | None = None,
+) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor, Tensor]:
+    """`composite` and what its backward pass starts from, int32 [H, W] each.
+
+    `last` is the last contributing fragment, counted from the first of its tile; `hit` is the Gaussian that gave the
+    surface depth, empty without `wants_depth`. Both are -1 where there is none.
+    """
     device = lists.order.device
-    block = (schedule or ("block" if device.type == "cuda" else "lanes")) == "block"
+    last = torch.empty(camera.size, dtype=torch.int32, device=device)
+    hit = torch.empty(camera.size if wants_depth else (0, 0), dtype=torch.int32, device=device)
+    return (*_composite(lists, camera, settings, features, wants_depth, schedule, last, hit), last, hit)
+
+
+def runs_in_blocks(device: torch.device, schedule: str | None) -> bool:
+    """Whether the block schedule runs: the one asked for, by default the device's own."""
+    return (schedule or ("block" if device.type == "cuda" else "lanes")) == "block"
+
+
+def _composite(
+    lists: tiles.TileLists,
+    camera: Camera,
+    settings: RasterSettings,
+    features: Tensor | None,
+    wants_depth: bool,
+    schedule: str | None,
+    last: Tensor | None,
+    hit: Tensor | None,
+) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+    device = lists.order.device
+    block = runs_in_blocks(device, schedule)
     height, width = camera.size
     transmittance = torch.empty(height, width, device=device)
     wide = features is not None and features.shape[1] > 3
@@ -122,17 +159,22 @@ def composite(
     image = None
     if wide:
         assert features is not None
-        image = _composite_wide(lists, camera, settings, features, transmittance, block)
+        image = _composite_wide(lists, camera, settings, features, transmittance, last, block)
     if not wide or wants_depth:
         colors = torch.empty(height, width, 3, device=device)
         inputs = [view(lists.offsets, wp.int32), lists.fragments, tiles.knobs(settings), width, height]
         outputs = [view(colors, wp.vec3), *(view(t, wp.float32) for t in (transmittance, depth_sum, surface))]
+        if last is not None and hit is not None:
+            outputs += [view(last, wp.int32), view(hit, wp.int32)]
         if block:
-            kernel = compositing_block.make_composite_colors_block(wants_depth)
+            make = compositing_block.make_composite_colors_block
+            kernel = (make if last is None else compositing_block.make_record_colors_block)(wants_depth)
             launch_blocks(kernel, [lists.tile_count], inputs, outputs, device=device)
         else:
-            kernel = compositing_lanes.make_composite_colors(wants_depth)
-            state = lane_scratch("state", TILE_ROWS, 6 if wants_depth else 4, device)
+            make = compositing_lanes.make_composite_colors
+            kernel = (make if last is None else compositing_lanes_record.make_record_colors)(wants_depth)
+            planes = compositing_lanes.color_planes(wants_depth, last is not None)
+            state = lane_scratch("state", TILE_ROWS, planes, device)
             launch(kernel, lists.tile_count, [*inputs, state], outputs, device=device, slots=True)
         if image is None:
             image = colors if features is None else colors[..., : features.shape[1]]
@@ -166,6 +208,7 @@ def _composite_wide(
     settings: RasterSettings,
     features: Tensor,
     transmittance: Tensor,
+    last: Tensor | None,
     block: bool,
 ) -> Tensor:
     device = lists.order.device
@@ -176,8 +219,11 @@ def _composite_wide(
     lead = [view(lists.offsets, wp.int32), lists.fragments]
     tail = [tiles.knobs(settings), width, height]
     outputs = [view(image, wp.float32), view(transmittance, wp.float32)]
+    if last is not None:
+        outputs.append(view(last, wp.int32))
     if block:
-        kernel = compositing_block.make_composite_features_block()
+        make_block = compositing_block.make_composite_features_block
+        kernel = (make_block if last is None else compositing_block.make_record_features_block)()
         launch_blocks(kernel, [lists.tile_count, count], [*lead, view(slices, Lanes), *tail], outputs, device=device)
         return image
     batch = compositing_lanes.BATCH
@@ -187,8 +233,9 @@ def _composite_wide(
     first = 0
     while first < count:
         width_of_pass = WIDE_PASS if count - first >= WIDE_PASS else 1
-        kernel = compositing_lanes.make_composite_features(width_of_pass)
-        state = lane_scratch("state", TILE_ROWS, 1 + LANE * width_of_pass, device)
+        make = compositing_lanes.make_composite_features
+        kernel = (make if last is None else compositing_lanes_record.make_record_features)(width_of_pass)
+        state = lane_scratch("state", TILE_ROWS, 1 + LANE * width_of_pass + (last is not None), device)
         inputs = [*lead, view(slices.unsqueeze(2), Lanes), first, *tail, state, weights, owner_array]
         launch(kernel, lists.tile_count, inputs, outputs, device=device, slots=True)
         first += width_of_pass

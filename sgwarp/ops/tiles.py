@@ -37,7 +37,7 @@ class Projected:
 
 @dataclass(frozen=True)
 class TileLists:
-    """Fragments of one view, tile by tile, front to back; scratch, valid until the next view."""
+    """Fragments of one view, tile by tile, front to back; scratch, valid until the next view, unless they were kept."""
 
     order: Tensor  # int32 [V] Gaussians by (depth, index)
     entries: Tensor  # int32 [V + 1] first intersection of each entry of `order`
@@ -46,10 +46,27 @@ class TileLists:
     intersections: int  # I
     places: Tensor  # int32 [I] position in the tile lists of each intersection, by Gaussian; empty unless asked for
     tiles: Tensor  # int32 [I] tile of each intersection, by Gaussian; empty unless asked for
+    memory: Tensor  # int32, flat: what `fragments` is a view of
 
     @property
     def tile_count(self) -> int:
         return len(self.offsets) - 1
+
+
+def fragment_memory(count: int, device: torch.device, keep: bool) -> Tensor:
+    """Room for `count` fragments, int32, flat: scratch, or memory of its own where they are kept."""
+    words = count * wp.types.type_size_in_bytes(binning.Fragment) // 4
+    if keep:
+        return torch.empty(words, dtype=torch.int32, device=device)
+    return scratch("fragments", words, torch.int32, device)
+
+
+def as_fragments(memory: Tensor) -> wp.array:
+    """The memory as an array of fragments; it must outlive the array."""
+    size = wp.types.type_size_in_bytes(binning.Fragment)
+    count = len(memory) * 4 // size
+    device = wp.device_from_torch(memory.device)
+    return wp.array(ptr=memory.data_ptr(), dtype=binning.Fragment, shape=(count,), capacity=count * size, device=device)
 
 
 def pinhole(camera: Camera) -> Pinhole:
@@ -154,8 +171,13 @@ def bin_splats(
     settings: RasterSettings,
     *,
     places: bool = False,
+    keep: bool = False,
 ) -> TileLists:
-    """Write the tile lists of a view; `colors` [V, 3] travel with the fragments, `places` only if asked for."""
+    """Write the tile lists of a view.
+
+    `colors` [V, 3] travel with the fragments, `places` and `tiles` are filled only if asked for by `places`. With
+    `keep` the lists have memory of their own: they outlive the view, as a backward pass needs it.
+    """
     device = order.device
     columns, rows = -(-camera.width // TILE), -(-camera.height // TILE)
     level = math.log2(settings.alpha_min)
@@ -164,12 +186,18 @@ def bin_splats(
     launch(binning.gather_splats, len(order), [view(order, wp.int32), projected.splats], [ordered], device=device)
     grid = (columns * rows, camera.width, camera.height)
     if device.type == "cuda":
-        return bin_by_sorting(ordered, projected.status, order, packed, grid, level)
-    return bin_by_counting(ordered, order, packed, grid, level, places)
+        return bin_by_sorting(ordered, projected.status, order, packed, grid, level, keep)
+    return bin_by_counting(ordered, order, packed, grid, level, places, keep)
 
 
 def bin_by_counting(
-    splats: wp.array, order: Tensor, colors: wp.array, grid: tuple[int, int, int], level: float, with_places: bool
+    splats: wp.array,
+    order: Tensor,
+    colors: wp.array,
+    grid: tuple[int, int, int],
+    level: float,
+    with_places: bool,
+    keep: bool = False,
 ) -> TileLists:
     """Count and fill in slices of the depth order (CPU); `grid` is tiles, width, height."""
     tiles, width, height = grid
@@ -186,16 +214,24 @@ def bin_by_counting(
     cursors = (by_tile.cumsum(0, dtype=torch.int32) - by_tile).view(tiles, SLICES).t().contiguous()
     offsets = torch.cat([cursors[0], entries[-1:]])
     total = int(entries[-1])
-    fragments = scratch_structs("fragments", total, binning.Fragment, device)
+    memory = fragment_memory(total, device, keep)
+    fragments = as_fragments(memory)
     places, owners = (scratch(name, total if with_places else 0, torch.int32, device) for name in ("places", "tiles"))
     inputs = [view(order, wp.int32), splats, colors, *sizes, view(entries, wp.int32)]
     outputs = [view(cursors, wp.int32), fragments, view(places, wp.int32), view(owners, wp.int32)]
     launch(binning.fill_tiles, SLICES, inputs, outputs, device=device, chunk=1)
-    return TileLists(order, entries, offsets, fragments, total, places, owners)
+    order = order.clone() if keep else order
+    return TileLists(order, entries, offsets, fragments, total, places, owners, memory)
 
 
 def bin_by_sorting(
-    splats: wp.array, status: Tensor, order: Tensor, colors: wp.array, grid: tuple[int, int, int], level: float
+    splats: wp.array,
+    status: Tensor,
+    order: Tensor,
+    colors: wp.array,
+    grid: tuple[int, int, int],
+    level: float,
+    keep: bool = False,
 ) -> TileLists:
     """Emit in depth order, sort by tile, pack (CUDA); the lists are those of `bin_by_counting`."""
     tiles, width, height = grid
@@ -205,7 +241,8 @@ def bin_by_sorting(
     launch_plain(binning.count_splat_tiles, count, shared, [view(splat_counts, wp.int32)], device=device)
     entries = _first_places(splat_counts)
     total = int(entries[-1])
-    fragments = scratch_structs("fragments", total, binning.Fragment, device)
+    memory = fragment_memory(total, device, keep)
+    fragments = as_fragments(memory)
     places, owners = (scratch(name, total, torch.int32, device) for name in ("places", "tiles"))
     keys = scratch("tile keys", 2 * total, torch.int32, device)
     values = scratch("tile values", 2 * total, torch.int32, device)
@@ -219,4 +256,5 @@ def bin_by_sorting(
     offsets = torch.searchsorted(keys[:total], edges).to(torch.int32)
     inputs = [*(view(t, wp.int32) for t in (keys, values, ranks, order)), splats, colors, width]
     launch_plain(binning.pack_fragments, total, inputs, [fragments, view(places, wp.int32)], device=device)
-    return TileLists(order, entries, offsets, fragments, total, places, owners)
+    order = order.clone() if keep else order
+    return TileLists(order, entries, offsets, fragments, total, places, owners, memory)

@@ -1,6 +1,7 @@
 """Every kernel that CUDA runs compiles to PTX without a GPU; with ptxas at hand, none of them spills registers."""
 
 import importlib
+import itertools
 import pkgutil
 import re
 import shutil
@@ -12,7 +13,7 @@ import pytest
 import warp as wp
 
 import sgwarp.kernels
-from sgwarp.kernels import compositing_block, lifting_block, pixel_lists
+from sgwarp.kernels import compositing_block, compositing_block_backward, lifting_block, pixel_lists
 from sgwarp.ops import launch  # noqa: F401 - starts Warp quietly
 
 ARCHITECTURES = (80, 86, 89, 90)
@@ -29,10 +30,15 @@ def cuda_kernels() -> list[wp.Kernel]:
             ]
     for flag in (False, True):
         kernels.append(compositing_block.make_composite_colors_block(flag))
+        kernels.append(compositing_block.make_record_colors_block(flag))
         kernels.append(lifting_block.make_lift_dense_block(flag))
         kernels.append(lifting_block.make_lift_ids_block(flag))
         kernels.append(pixel_lists.make_list_contributors(flag))
     kernels.append(compositing_block.make_composite_features_block())
+    kernels.append(compositing_block.make_record_features_block())
+    for wide, ordered in itertools.product((False, True), repeat=2):
+        # The options go together here: each adds its own lines to a kernel, and together they need most registers.
+        kernels.append(compositing_block_backward.make_composite_backward_block(wide, ordered, ordered, ordered))
     return kernels
 
 
@@ -43,10 +49,14 @@ def test_the_list_of_kernels_is_complete():
         "list_contributors",
         "composite_colors_block",
         "composite_features_block",
+        "record_colors_block",
+        "record_features_block",
+        "composite_backward_block",
         "lift_dense_block",
         "lift_ids_block",
     }
     assert factories <= names
+    assert {"project_backward", "harmonics_backward", "sum_intersections", "sum_groups"} <= names
 
 
 @pytest.fixture(scope="module")

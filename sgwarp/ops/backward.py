@@ -1,0 +1,286 @@
+"""The rasterizer's backward pass, stage by stage: images -> splats -> Gaussians, colours, pose."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import torch
+import warp as wp
+from torch import Tensor
+from torch.nn.functional import pad
+
+from sgwarp.kernels import compositing_block_backward, compositing_lanes_backward, harmonics_backward
+from sgwarp.kernels import projection_backward as kernels
+from sgwarp.kernels.compositing_lanes_backward import MOMENTS, SUMS, row_columns
+from sgwarp.kernels.transmittance import Lanes
+from sgwarp.ops import tiles
+from sgwarp.ops.launch import get_threads, launch, launch_blocks, scratch, view
+from sgwarp.ops.lift import LiftSums, add_weighted
+from sgwarp.ops.rasterize import LANE, TILE_ROWS, in_slices, lane_scratch, runs_in_blocks
+from sgwarp.ops.settings import RasterSettings
+from sgwarp.scene import Camera, FeatureMap, Gaussians
+
+GROUPS = 1024  # partial sums of the pose's gradient
+
+
+@dataclass(frozen=True, eq=False)
+class ImageGradients:
+    """Gradient of the loss with respect to what compositing returns; None is zero.
+
+    Attributes:
+        features: float32 [H, W, C].
+        transmittance: float32 [H, W].
+        depth_sum: Of sum alpha T z, float32 [H, W].
+        surface: Of the surface depth, float32 [H, W].
+    """
+
+    features: Tensor | None = None
+    transmittance: Tensor | None = None
+    depth_sum: Tensor | None = None
+    surface: Tensor | None = None
+
+
+@dataclass(frozen=True, eq=False)
+class SplatGradients:
+    """What compositing passes back to the splats; rows of Gaussians that reached no tile are zero.
+
+    Attributes:
+        sums: Moments of g under 1, u, v, u^2, u v, v^2 (see kernels/projection_backward.py), then others, [N, 16].
+        at_depth: Column of `sums` with the gradient of the depth, -1 if there is none.
+        features: Gradient of the composited features, [N, C].
+        absolute: Sum over the pixels of the magnitude of each one's gradient of the projected centre, [N, 2]; or None.
+    """
+
+    sums: Tensor
+    at_depth: int
+    features: Tensor
+    absolute: Tensor | None
+
+
+@dataclass(frozen=True, eq=False)
+class GaussianGradients:
+    """Gradients with respect to what projection reads, float32 [N, ...]; `poses` [N, 12] is empty unless asked for."""
+
+    means: Tensor
+    quats: Tensor
+    scales: Tensor
+    opacities: Tensor
+    means2d: Tensor
+    poses: Tensor
+
+
+def composite_backward(
+    lists: tiles.TileLists,
+    camera: Camera,
+    settings: RasterSettings,
+    features: Tensor | None,
+    channels: int,
+    recorded: tuple[Tensor, Tensor, Tensor],
+    gradients: ImageGradients,
+    count: int,
+    *,
+    absolute: bool = False,
+    schedule: str | None = None,
+    deterministic: bool | None = None,
+) -> SplatGradients:
+    """Differentiate `composite_recorded`.
+
+    Args:
+        lists: Kept tile lists of the view.
+        features: What was composited if it did not travel with the fragments, [N, C].
+        channels: Of the image.
+        recorded: Transmittance, `last` and `hit` as compositing returned them.
+        gradients: Of the loss.
+        count: N.
+        absolute: Also sum magnitudes.
+        schedule: "lanes" or "block", by default the device's own.
+        deterministic: Add up in a fixed order. The CPU always does; on CUDA the default is atomic additions.
+    """
+    device = lists.order.device
+    block = runs_in_blocks(device, schedule)
+    ordered = not block or (device.type == "cpu" if deterministic is None else deterministic)
+    transmittance, last, hit = recorded
+    wide = channels > 3
+    zeros = torch.zeros_like(transmittance)
+    v_image = zeros[..., None].expand(-1, -1, channels) if gradients.features is None else gradients.features
+    v_transmittance = zeros if gradients.transmittance is None else gradients.transmittance
+    v_depth = zeros if gradients.depth_sum is None else gradients.depth_sum
+    depth = gradients.depth_sum is not None or gradients.surface is not None
+    at_depth, at_absolute, _ = row_columns(wide, depth, absolute)
+    sums = torch.zeros(count, LANE, device=device)
+    rows = scratch("backward rows", lists.intersections * LANE if ordered else 0, torch.float32, device).view(-1, LANE)
+    slices = in_slices(features if wide and features is not None else zeros[:1, :1])
+    head = [view(lists.offsets, wp.int32), lists.fragments]
+    size = [tiles.knobs(settings), camera.width, camera.height]
+    if block:
+        maps = [view(t.contiguous(), wp.float32) for t in (transmittance, v_transmittance, v_image, v_depth)]
+        inputs = [*head, view(slices, Lanes), *maps, view(last, wp.int32), *size]
+        kernel = compositing_block_backward.make_composite_backward_block(wide, depth, absolute, ordered)
+        outputs = [view(rows if ordered else sums, wp.float32)]
+        launch_blocks(kernel, [lists.tile_count], inputs, outputs, device=device)
+    else:
+        shape = (camera.height, -(-camera.width // LANE), -1, LANE)
+        room = shape[0] * shape[1] * LANE
+        pixels = scratch("backward pixels", room * 3, torch.float32, device).view(shape)
+        for plane, (image, outside) in enumerate(((transmittance, 1.0), (v_transmittance, 0.0), (last, -1.0))):
+            _in_lanes(image[..., None], pixels[:, :, plane : plane + 1], outside)
+        padded = slices.shape[1] * LANE if wide else 3
+        gradient = scratch("backward gradient", room * (padded + depth), torch.float32, device).view(shape)
+        _in_lanes(v_image, gradient[:, :, :padded])
+        if depth:
+            _in_lanes(v_depth[..., None], gradient[:, :, padded:])
+        scratches = [
+            lane_scratch("backward state", TILE_ROWS, 2, device),
+            view(scratch("reach", get_threads() * TILE_ROWS, torch.int32, device).view(-1, TILE_ROWS), wp.int32),
+            lane_scratch("backward sums", LANE, SUMS, device),
+        ]
+        inputs = [*head, view(slices.unsqueeze(2), Lanes), view(pixels, Lanes), view(gradient, Lanes), *size]
+        kernel = compositing_lanes_backward.make_composite_backward(wide, depth, absolute)
+        launch(kernel, lists.tile_count, [*inputs, *scratches], [view(rows, Lanes)], device=device, slots=True)
+    if ordered:
+        inputs = [view(lists.order, wp.int32), view(lists.entries, wp.int32), view(rows, Lanes)]
+        outputs = [view(sums, Lanes)]
+        launch(kernels.sum_intersections, len(lists.order), inputs, outputs, device=device)
+    if gradients.surface is not None:
+        seen = hit >= 0
+        sums[:, at_depth].index_add_(0, hit[seen].to(torch.int64), gradients.surface[seen])
+    if not wide:
+        v_features = sums[:, MOMENTS : MOMENTS + channels]
+    else:
+        v_features = _lift_gradient(lists, camera, v_image, settings, count, block, ordered)
+    # The kernel leaves out the factor of d(2^x) = ln 2 2^x dx, and that of the square.
+    magnitudes = 2.0 * kernels.LN_2 * sums[:, at_absolute : at_absolute + 2] if absolute else None
+    return SplatGradients(sums, at_depth if depth else -1, v_features, magnitudes)
+
+
+def _in_lanes(image: Tensor, out: Tensor, outside: float = 0.0) -> None:
+    """Write an image [H, W, C] with 16 pixels of a row in a vector, `out` is [H, tile columns, C or more, 16].
+
+    Pixels beyond its edge are `outside`, channels beyond its last are zero.
+    """
+    _, columns, channels, _ = out.shape
+    height, width, given = image.shape
+    if width % LANE:
+        image = pad(image, (0, 0, 0, columns * LANE - width), value=outside)
+    if given < channels:
+        image = pad(image, (0, channels - given))
+    out.copy_(image.reshape(height, columns, LANE, channels).transpose(2, 3))
+
+
+def _lift_gradient(
+    lists: tiles.TileLists,
+    camera: Camera,
+    v_image: Tensor,
+    settings: RasterSettings,
+    count: int,
+    block: bool,
+    ordered: bool,
+) -> Tensor:
+    """Gradient of the features: the image is A x, so it is A^T v, the image's gradient lifted onto the Gaussians."""
+    sums = LiftSums.zeros(count, v_image.shape[2], v_image.device)
+    feature_map = FeatureMap(space="gradient", dense=v_image.contiguous())
+    add_weighted(lists, camera, feature_map, sums, settings, block=block, ordered=ordered)
+    return sums.features
+
+
+def project_backward(
+    gaussians: Gaussians,
+    camera: Camera,
+    settings: RasterSettings,
+    splats: SplatGradients,
+    *,
+    pose: bool = False,
+) -> GaussianGradients:
+    """Differentiate `tiles.project`; `pose` asks for each Gaussian's share of the pose's gradient."""
+    n, device = len(gaussians), gaussians.device
+    result = GaussianGradients(
+        means=torch.zeros(n, 3, device=device),
+        quats=torch.zeros(n, 4, device=device),
+        scales=torch.zeros(n, 3, device=device),
+        opacities=torch.zeros(n, device=device),
+        means2d=torch.zeros(n, 2, device=device),
+        poses=torch.zeros(n if pose else 0, kernels.POSE_COLUMNS, device=device),
+    )
+    inputs = [
+        view(gaussians.means, wp.vec3),
+        view(gaussians.quats, wp.vec4),
+        view(gaussians.scales, wp.vec3),
+        view(gaussians.opacities, wp.float32),
+        tiles.pinhole(camera),
+        tiles.knobs(settings),
+        view(splats.sums, wp.float32),
+        splats.at_depth,
+    ]
+    outputs = [
+        view(result.means, wp.vec3),
+        view(result.quats, wp.vec4),
+        view(result.scales, wp.vec3),
+        view(result.opacities, wp.float32),
+        view(result.means2d, wp.vec2),
+        view(result.poses, wp.float32),
+    ]
+    launch(kernels.project_backward, n, inputs, outputs, device=device)
+    return result
+
+
+def shade_backward(
+    gaussians: Gaussians,
+    camera: Camera,
+    settings: RasterSettings,
+    splats: SplatGradients,
+    v_means: Tensor,
+    *,
+    pose: bool = False,
+) -> tuple[Tensor, Tensor]:
+    """Differentiate `tiles.shade`; `v_means` is added to.
+
+    Returns:
+        Gradient of the coefficients, [N, K, 3], and of each centre seen from the camera's, [N, 3] or, unless `pose`,
+        empty.
+    """
+    n, device = len(gaussians), gaussians.device
+    degree = gaussians.sh_degree if settings.sh_degree is None else min(settings.sh_degree, gaussians.sh_degree)
+    v_sh = torch.zeros_like(gaussians.sh)
+    v_offsets = torch.zeros(n if pose else 0, 3, device=device)
+    inputs = [
+        view(gaussians.means, wp.vec3),
+        view(gaussians.sh, wp.vec3),
+        degree,
+        tiles.pinhole(camera),
+        view(splats.sums, wp.float32),
+        MOMENTS,
+    ]
+    outputs = [view(v_sh, wp.vec3), view(v_means, wp.vec3), view(v_offsets, wp.float32)]
+    launch(harmonics_backward.harmonics_backward, n, inputs, outputs, device=device)
+    return v_sh, v_offsets
+
+
+def pose_gradient(camera: Camera, poses: Tensor, v_offsets: Tensor | None) -> Tensor:
+    """Gradient of the world-to-camera matrix, float64 [4, 4] on the CPU, from every Gaussian's share.
+
+    Args:
+        poses: Of the rotation about the camera's centre and of the translation, [N, 12].
+        v_offsets: Of each centre seen from the camera's, [N, 3], where colours depend on the direction.
+    """
+    total = _sum_rows(poses).cpu()
+    v_translation = total[9:]
+    center = camera.position
+    gradient = torch.zeros(4, 4, dtype=torch.float64)
+    # p = R m + t, and m = (m - center) + center.
+    gradient[:3, :3] = total[:9].view(3, 3) + torch.outer(v_translation, center)
+    gradient[:3, 3] = v_translation
+    if v_offsets is not None:
+        v_center = -_sum_rows(v_offsets).cpu()
+        rotation, translation = camera.world_to_camera[:3, :3], camera.world_to_camera[:3, 3]
+        gradient[:3, :3] -= torch.outer(translation, v_center)
+        gradient[:3, 3] -= rotation @ v_center
+    return gradient
+
+
+def _sum_rows(rows: Tensor) -> Tensor:
+    """Column sums in double precision, the same bits for any number of threads, float64 [Q]."""
+    per_group = max(1, -(-len(rows) // GROUPS))
+    partial = torch.zeros(GROUPS, rows.shape[1], dtype=torch.float64, device=rows.device)
+    inputs = [view(rows, wp.float32), per_group]
+    launch(kernels.sum_groups, GROUPS, inputs, [view(partial, wp.float64)], device=rows.device)
+    return partial.sum(dim=0)
