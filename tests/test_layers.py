@@ -35,6 +35,7 @@ ORDER = (
     "query",
     "segment",
     "evaluate",
+    "report",
     "demo",
     "commands",
     "cli",

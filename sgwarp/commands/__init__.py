@@ -8,6 +8,15 @@ from sgwarp.commands.info import Info
 from sgwarp.commands.lift import Lift
 from sgwarp.commands.query import Query
 from sgwarp.commands.render import Render
+from sgwarp.commands.report import Report
 from sgwarp.commands.segment import Segment
 
-COMMANDS = {"lift": Lift, "query": Query, "segment": Segment, "render": Render, "info": Info, "demo": Demo}
+COMMANDS = {
+    "lift": Lift,
+    "query": Query,
+    "segment": Segment,
+    "render": Render,
+    "info": Info,
+    "report": Report,
+    "demo": Demo,
+}
