@@ -90,10 +90,10 @@ def confidence(scores: Tensor, temperature: float) -> Tensor:
     """Softmax of scores / temperature over the queries, [..., Q].
 
     Raises:
-        InputError: The temperature is not positive.
+        InputError: The temperature is not positive and finite.
     """
-    if not temperature > 0:
-        raise InputError(f"temperature: expected a positive number, got {temperature}")
+    if not 1e-6 <= temperature < float("inf"):
+        raise InputError(f"temperature: expected a number from 1e-6 on, got {temperature}")
     return torch.softmax(scores / temperature, dim=-1)
 
 

@@ -40,6 +40,8 @@ def render(
     Raises:
         InputError: Unknown mode, or features missing where they are needed or given where they are not.
     """
+    if not isinstance(camera, Camera):
+        raise InputError(f"camera: expected a Camera, got {type(camera).__name__}; a view has one: view.camera")
     if mode not in get_args(RenderMode):
         raise InputError(f"mode: '{mode}' is not one of {', '.join(get_args(RenderMode))}")
     if (mode == "features") != (features is not None):

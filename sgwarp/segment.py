@@ -181,8 +181,13 @@ def localize(
 
 def box_mean(image: Tensor, known: Tensor, side: int) -> Tensor:
     """Mean over the known pixels of the `side` x `side` box around each pixel; 0 if there are none, float32 [H, W]."""
-    before = (side - 1) // 2
-    pad = (before, side - 1 - before) * 2
     pair = torch.stack([torch.where(known, image, 0.0), known.to(image)]).double()
-    total, count = torch.nn.functional.avg_pool2d(torch.nn.functional.pad(pair, pad)[None], side, stride=1)[0]
+    for axis in (1, 2):  # sums of a box are differences of running sums: the cost does not depend on its side
+        size = pair.shape[axis]
+        place = torch.arange(size, device=image.device) - (side - 1) // 2
+        running = torch.cat([torch.zeros_like(pair.narrow(axis, 0, 1)), pair.cumsum(axis)], dim=axis)
+        first, last = place.clamp(0, size), (place + side).clamp(0, size)
+        pair = running.index_select(axis, last) - running.index_select(axis, first)
+    total, count = pair
+    count = count.round()
     return (total / torch.where(count > 0, count, 1.0)).to(torch.float32)

@@ -46,11 +46,11 @@ class Options:
         """
         import torch
 
-        from sgwarp.ops.launch import get_threads, set_threads
+        from sgwarp.ops.launch import MAX_THREADS, get_threads, set_threads
 
         if self.threads is not None:
-            if self.threads < 1:
-                raise InputError(f"--threads: expected 1 or more, got {self.threads}")
+            if not 1 <= self.threads <= MAX_THREADS:
+                raise InputError(f"--threads: expected 1 to {MAX_THREADS}, got {self.threads}")
             set_threads(self.threads)
             torch.set_num_threads(self.threads)
         if self.device == "cuda" and not torch.cuda.is_available():
@@ -148,3 +148,5 @@ def check_folder(option: str, folder: Path) -> None:
     existing = next(path for path in (folder, *folder.absolute().parents) if path.exists())
     if not existing.is_dir() or not os.access(existing, os.W_OK):
         raise InputError(f"{option} {folder}: {existing} is not a folder that can be written to; choose another")
+    if (folder / "run.json").is_dir():
+        raise InputError(f"{option} {folder}: its run.json is a folder, where the log of this run goes; choose another")

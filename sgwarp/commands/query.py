@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Literal
@@ -45,6 +46,10 @@ class Query(SemanticsOptions):
         check_name("--out", self.out, ".png")
         if not self.text.strip():
             raise InputError("--text: is empty; say what to look for")
+        if not math.isfinite(self.threshold):
+            raise InputError(f"--threshold: expected a finite number, got {self.threshold}")
+        if self.box < 1:
+            raise InputError(f"--box: expected a side of 1 pixel or more, got {self.box}")
         with self.logged(self.out.parent) as log:
             from sgwarp.io.images import write_ids, write_rgb
             from sgwarp.pictures import heat_map, mark_pixel

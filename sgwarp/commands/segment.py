@@ -44,6 +44,8 @@ class Segment(SemanticsOptions):
 
     def run(self) -> None:
         check_folder("--out", self.out)
+        if not 0.0 <= self.unknown_below <= 1.0:
+            raise InputError(f"--unknown-below: expected a confidence from 0 to 1, got {self.unknown_below}")
         classes = None if self.classes is None else class_names(self.classes)
         with self.logged(self.out) as log:
             from sgwarp.encoders.registry import text_encoder_for

@@ -15,7 +15,14 @@ from sgwarp.encoders.class_space import SPACE, imagenet_space
 from sgwarp.encoders.conse_text import ConseText
 from sgwarp.encoders.imagenet_classifier import ImageClassifier, LogitMap
 from sgwarp.encoders.prompts import PLAIN
-from sgwarp.encoders.regions import bounding_squares, cut_squares, region_areas, region_means, segment_regions
+from sgwarp.encoders.regions import (
+    Proposals,
+    bounding_squares,
+    cut_squares,
+    propose_regions,
+    region_areas,
+    region_means,
+)
 from sgwarp.errors import InputError
 from sgwarp.scene import FeatureMap, View
 
@@ -29,7 +36,8 @@ class ConseSettings:
     Attributes:
         map_sides: Longest side that the image is resized to for each pass over all locations [pixels].
         side: Longest side of the image that is segmented, and of the id map [pixels].
-        scales: Scale of the graph segmentation, one level of regions for each.
+        proposals: How regions are proposed: "graph", "slic", "seeds" or "selective"; see `propose_regions`.
+        scales: Scale of the proposals, one level of regions for each.
         smallest: Least area of a region.
         crop_smallest: Least area of a region that is cut out; smaller ones are known by their locations alone.
         crop_largest: Greatest share of the image that a region to be cut out may cover.
@@ -41,6 +49,7 @@ class ConseSettings:
 
     map_sides: tuple[int, ...] = (480,)
     side: int = 480
+    proposals: Proposals = "graph"
     scales: tuple[float, ...] = (300.0,)
     smallest: int = 60
     crop_smallest: int = 100
@@ -117,7 +126,8 @@ class Conse:
         small = self._segmented(image)
         levels, vectors, count = [], [], 0
         for scale in self.settings.scales:
-            regions = segment_regions(small, scale, round(self.settings.smallest * self._unit(small)))
+            smallest = round(self.settings.smallest * self._unit(small))
+            regions = propose_regions(small, self.settings.proposals, scale, smallest)
             logits = torch.zeros(int(regions.max()) + 1, maps[0].logits.shape[-1])
             for found in maps:
                 logits += region_means(regions, *found.interpolation(*regions.shape), found.logits) / len(maps)

@@ -2,13 +2,13 @@
 
 Image-level encoders need regions to look at. Where no mask model is at hand, the graph segmentation of Felzenszwalb and
 Huttenlocher (Efficient Graph-Based Image Segmentation, 2004) gives them in under a tenth of a second; on plain surfaces
-its regions follow objects more closely than superpixels of equal size do.
+its regions follow objects more closely than superpixels of equal size do, so it is the default.
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Any
+from typing import Any, Literal, get_args
 
 import numpy as np
 import torch
@@ -19,6 +19,67 @@ from sgwarp.errors import InputError
 
 SMOOTHING = 0.5  # standard deviation of the blur before segmentation [pixels]
 GREY = 127  # of what lies outside the image
+
+
+Proposals = Literal["graph", "slic", "seeds", "selective"]
+
+
+def propose_regions(image: NDArray[np.uint8], method: Proposals, scale: float, smallest: int = 1) -> NDArray[np.int32]:
+    """Partition an image, uint8 [H, W, 3] RGB, into regions: their numbers from 0 on, int32 [H, W].
+
+    Args:
+        image: The image.
+        method: "graph" (`segment_regions`), superpixels "slic" or "seeds" (Achanta et al. 2012; Van den Bergh et al.
+            2012), or "selective" (Uijlings et al. 2013): the boxes of a fast selective search, painted from the
+            largest to the smallest.
+        scale: k of the graph segmentation, else the side of a superpixel or of the smallest box [pixels].
+        smallest: Least area of a region of the graph segmentation [pixels].
+
+    Raises:
+        InputError: The method is unknown, or OpenCV comes without its contributed modules.
+    """
+    if method not in get_args(Proposals):
+        raise InputError(f"proposals: '{method}' is not one of {', '.join(get_args(Proposals))}")
+    if method == "graph":
+        return segment_regions(image, scale, smallest)
+    if method == "selective":
+        return _paint_boxes(image, round(scale))
+    return _superpixels(image, method, max(4, round(scale)))
+
+
+def _superpixels(image: NDArray[np.uint8], method: str, side: int) -> NDArray[np.int32]:
+    import cv2
+
+    _segmentation()
+    lab = cv2.cvtColor(np.ascontiguousarray(image), cv2.COLOR_RGB2LAB)
+    height, width = image.shape[:2]
+    if method == "slic":
+        slic = cv2.ximgproc.createSuperpixelSLIC(lab, cv2.ximgproc.SLICO, side)
+        slic.iterate(10)
+        slic.enforceLabelConnectivity()
+        return _numbered(np.asarray(slic.getLabels()))
+    count = max(1, height * width // side**2)
+    seeds = cv2.ximgproc.createSuperpixelSEEDS(width, height, 3, count, 4)
+    seeds.iterate(lab, 10)
+    return _numbered(np.asarray(seeds.getLabels()))
+
+
+def _paint_boxes(image: NDArray[np.uint8], least: int) -> NDArray[np.int32]:
+    search = _segmentation().createSelectiveSearchSegmentation()
+    search.setBaseImage(np.ascontiguousarray(image[:, :, ::-1]))
+    search.switchToSelectiveSearchFast()
+    boxes = np.asarray(search.process())
+    boxes = boxes[boxes[:, 2:].min(axis=1) >= least]
+    painted = np.zeros(image.shape[:2], np.int32)
+    order = np.argsort(-boxes[:, 2].astype(np.int64) * boxes[:, 3], kind="stable")
+    for number, (x, y, wide, high) in enumerate(boxes[order], start=1):
+        painted[y : y + high, x : x + wide] = number
+    return _numbered(painted)
+
+
+def _numbered(labels: NDArray[Any]) -> NDArray[np.int32]:
+    """The same partition with numbers from 0 on without gaps."""
+    return np.unique(labels, return_inverse=True)[1].reshape(labels.shape).astype(np.int32)
 
 
 def segment_regions(image: NDArray[np.uint8], scale: float, smallest: int) -> NDArray[np.int32]:

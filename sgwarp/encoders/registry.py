@@ -12,14 +12,16 @@ from sgwarp.encoders.files import LABEL_SPACE, open_files
 from sgwarp.errors import InputError
 from sgwarp.scene import View
 
-NAMES = ("conse", "conse:regions", "conse:dense", "files:DIR")
+NAMES = ("conse", "conse:regions", "conse:dense", "conse:slic", "conse:seeds", "conse:selective", "files:DIR")
+SUPERPIXEL_SIDE = 24.0  # [pixels], of an image of 480
 
 
 def make_encoder(name: str, views: Sequence[View] = (), device: str | torch.device = "cpu") -> MapSource:
     """The source of feature maps with a name.
 
     Args:
-        name: "conse" (regions), "conse:dense", or "files:DIR" with options as in `open_files`.
+        name: "conse" (regions of the graph segmentation), "conse:dense", "conse:slic", "conse:seeds", "conse:selective"
+            (other proposals), or "files:DIR" with options as in `open_files`.
         views: The views that will be asked for; needed for files.
         device: Where a network runs.
 
@@ -29,10 +31,13 @@ def make_encoder(name: str, views: Sequence[View] = (), device: str | torch.devi
     kind, _, rest = name.partition(":")
     if kind == "files":
         return open_files(rest, views)
-    if kind == "conse" and rest in ("", "regions", "dense"):
-        from sgwarp.encoders.conse import Conse
+    if kind == "conse" and rest in ("", "regions", "dense", "slic", "seeds", "selective"):
+        from sgwarp.encoders.conse import Conse, ConseSettings
+        from sgwarp.encoders.regions import Proposals
 
-        return Conse("dense" if rest == "dense" else "regions", device=device)
+        others: dict[str, Proposals] = {"slic": "slic", "seeds": "seeds", "selective": "selective"}
+        settings = ConseSettings(proposals=others[rest], scales=(SUPERPIXEL_SIDE,)) if rest in others else None
+        return Conse("dense" if rest == "dense" else "regions", settings, device=device)
     raise InputError(f"encoder '{name}' does not exist; there are {', '.join(NAMES)}")
 
 

@@ -58,6 +58,8 @@ def read_elements(path: str | os.PathLike[str]) -> Elements:
             f"{path}: is cut short: element '{element.name}' should hold {size}, the file ends after "
             f"{error.row or 0} rows ({os.path.getsize(path)} bytes in all); copy or download it again"
         ) from None
+    except InputError:  # of `reading`, which says it all; it is a ValueError as well
+        raise
     except (plyfile.PlyParseError, ArithmeticError, LookupError, MemoryError, TypeError, ValueError) as error:
         reason = " ".join(str(error).split()) or type(error).__name__
         raise InputError(f"{path}: is not a valid PLY file ({reason})") from None

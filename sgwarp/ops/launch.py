@@ -18,7 +18,10 @@ import torch
 import warp as wp
 from torch import Tensor
 
+from sgwarp.errors import InputError
+
 CHUNKS_PER_THREAD = 8  # enough to even out tiles of different cost
+MAX_THREADS = 512
 SMALL = 256  # below this many threads of a launch, a second host thread costs more than it saves
 
 
@@ -65,11 +68,11 @@ def set_threads(count: int) -> None:
     """Use `count` host threads from now on; the results do not depend on it.
 
     Raises:
-        ValueError: `count` is not positive.
+        InputError: `count` is not positive, or far beyond any machine.
     """
     global _thread_count, _pool
-    if count < 1:
-        raise ValueError(f"threads: expected at least 1, got {count}")
+    if not 1 <= count <= MAX_THREADS:
+        raise InputError(f"threads: expected at least 1 and at most {MAX_THREADS}, got {count}")
     with _pool_lock:
         if count != _thread_count and _pool is not None:
             _pool.shutdown(wait=True)

@@ -6,7 +6,15 @@ import pytest
 import torch
 
 from sgwarp.encoders.imagenet_classifier import STRIDE, LogitMap
-from sgwarp.encoders.regions import bounding_squares, cut_squares, region_areas, region_means, segment_regions
+from sgwarp.encoders.regions import (
+    bounding_squares,
+    cut_squares,
+    propose_regions,
+    region_areas,
+    region_means,
+    segment_regions,
+)
+from sgwarp.errors import InputError
 
 
 @pytest.fixture
@@ -97,3 +105,25 @@ def test_opencv_without_contributed_modules(monkeypatch):
     monkeypatch.delattr(cv2, "ximgproc")
     with pytest.raises(InputError, match="pip install opencv-contrib-python-headless"):
         segment_regions(np.zeros((8, 8, 3), np.uint8), 100, 10)
+
+
+@pytest.mark.parametrize(("method", "scale"), [("graph", 300.0), ("slic", 16.0), ("seeds", 16.0), ("selective", 8.0)])
+def test_every_kind_of_proposal_separates_a_square_from_its_ground(method, scale):
+    image = np.full((96, 128, 3), 200, np.uint8)
+    image[30:70, 40:90] = (180, 30, 30)
+    image[30:70, 40:90] += np.random.default_rng(0).integers(0, 6, (40, 50, 3), dtype=np.uint8)
+    regions = propose_regions(image, method, scale, 50)
+    assert regions.shape == (96, 128)
+    assert regions.dtype == np.int32
+    assert set(np.unique(regions)) == set(range(regions.max() + 1))
+    inside = np.zeros((96, 128), bool)
+    inside[30:70, 40:90] = True
+    # Every region lies mostly on one side: the square can be put together from whole regions.
+    share = np.bincount(regions.ravel(), inside.ravel()) / np.bincount(regions.ravel())
+    square = share[regions] > 0.5
+    assert (square & inside).sum() / (square | inside).sum() > 0.85
+
+
+def test_unknown_proposals_are_refused():
+    with pytest.raises(InputError, match="graph, slic, seeds, selective"):
+        propose_regions(np.zeros((8, 8, 3), np.uint8), "sam", 1.0)

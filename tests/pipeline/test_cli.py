@@ -258,6 +258,12 @@ def test_bad_input_is_one_line(stage, stage_files, lifted, tmp_path, capsys):
     assert "orbit" in fails(capsys, "render", scene, "--out", tmp_path / "o", "--frames", "0")
     finding = ("query", scene, "--semantics", lifted, "--views", views, "--view", "0000", "--out", tmp_path / "m.png")
     assert "--text: is empty" in fails(capsys, *finding, "--text", " ")
+    assert "--threshold" in fails(capsys, *finding, "--text", "1", "--threshold", "nan")
+    assert "--box" in fails(capsys, *finding, "--text", "1", "--box", "0")
+    assert "--unknown-below" in fails(capsys, *asking, "--unknown-below", "7")
+    assert "--threads" in fails(capsys, *asking, "--threads", "100000")
+    (tmp_path / "taken" / "run.json").mkdir(parents=True)
+    assert "run.json is a folder" in fails(capsys, *asking[:-1], tmp_path / "taken")
 
     other = tmp_path / "other.ply"
     save_gaussians(stage.gaussians.subset(torch.arange(100)), other)

@@ -1,0 +1,58 @@
+"""`sgwarp report`: error against run time, knob by knob, and stability at the extremes."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+
+from sgwarp.commands.options import SceneOptions, check_folder, find_views
+
+
+@dataclass(kw_only=True)
+class Report(SceneOptions):
+    """Turn every knob on a scene, measure run time and error side by side, and check the extreme scenes."""
+
+    views: Path
+    """Posed photographs: a folder with transforms.json or a COLMAP model."""
+
+    out: Path
+    """Folder for report.md, report.json and the plot."""
+
+    labels: Path | None = None
+    """Folder of label images {stem}.png; with it, lifting is measured too, by mIoU on the held-out views."""
+
+    held_out: int = 2
+    """Views, evenly spread, that are measured on and not lifted from."""
+
+    patches: int = 60
+    """Patches of 16 x 16 pixels of each held-out view that the float64 oracle composites."""
+
+    repeats: int = 5
+    """Runs of which the median time is taken."""
+
+    seed: int = 0
+    """Of the patches and of the random share of Gaussians."""
+
+    extremes: bool = True
+    """Off: leave the extreme scenes out; they do not depend on the scene."""
+
+    def run(self) -> None:
+        check_folder("--out", self.out)
+        with self.logged(self.out) as log:
+            from sgwarp.report.extremes import EXTREMES
+            from sgwarp.report.run import make_report
+
+            gaussians = self.load_scene(log)
+            make_report(
+                gaussians,
+                find_views(self.views),
+                self.out,
+                self.scene.name.split(".")[0],
+                labels=self.labels,
+                held_out=self.held_out,
+                patches=self.patches,
+                repeats=self.repeats,
+                seed=self.seed,
+                extremes=tuple(EXTREMES) if self.extremes else (),
+                log=log,
+            )
