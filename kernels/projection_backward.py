@@ -90,7 +90,7 @@ def point_gradient(camera: Pinhole, point: wp.vec3, v_mean: wp.vec2, v_row_x: wp
     fx = camera.focal[0] * inv_z
     fy = camera.focal[1] * inv_z
     # Gradients of x/z and y/z; the rows are fx (1, 0, -tx) / z and fy (0, 1, -ty) / z.
-    v_x = camera.focal[0] * v_mean[0] - fx * v_row_x[2]
+    v_x = camera.focal[0] * v_mean[0] - wp.where(tx == x, fx * v_row_x[2], 0.0)
     v_y = camera.focal[1] * v_mean[1] - wp.where(ty == y, fy * v_row_y[2], 0.0)
     v_inv_z = camera.focal[0] * (v_row_x[0] - tx * v_row_x[2]) + camera.focal[1] * (v_row_y[1] - ty * v_row_y[2])
     return wp.vec3(v_x, v_y, -x * v_x - y * v_y - v_inv_z * inv_z) * inv_z
