@@ -4,19 +4,23 @@
 
 (a) a plain scalar Warp kernel, one thread per pixel (scalar.py); (b) the same work by hand in C++ with OpenMP
 (limit.cpp), called "the limit"; (c) one host thread against all. Every figure is the smallest of several runs, the
-runs of two rivals taking turns, so that a busy machine disturbs both. Absolute times are this machine's; carry over
-the ratios only.
+runs of two rivals taking turns, so that a busy machine disturbs both; all of them write to fresh memory. Absolute times
+are this machine's; carry over the ratios only.
 """
 
 from __future__ import annotations
 
 import argparse
 import json
+import os
 import platform
 import sys
 import time
 from collections.abc import Callable
 from pathlib import Path
+
+# OpenMP's threads otherwise go on spinning after the limit's turn, on the cores that its rival then needs.
+os.environ["OMP_WAIT_POLICY"] = "passive"
 
 import numpy as np
 import torch
@@ -69,7 +73,6 @@ def forward(count: int, cores: int, rounds: int) -> dict[str, float]:
     height, width = camera.size
     packed = scenes.projected(gaussians, camera)
     arrays = (packed.mean2d, packed.conic, packed.opacity, packed.color, packed.offsets, packed.ids, width, height)
-    target = (np.empty((height, width, 3), np.float32), np.empty((height, width), np.float32))
     launch.set_threads(cores)
     projected = tiles.project(gaussians, camera, SETTINGS)
     order = tiles.depth_order(projected)
@@ -78,7 +81,7 @@ def forward(count: int, cores: int, rounds: int) -> dict[str, float]:
     jobs: dict[str, Job] = {}
     for threads in sorted({1, cores}):
         mark = f"{threads} thread" + "s" * (threads > 1)
-        jobs[f"limit, {mark}"] = lambda t=threads: limit.composite(*arrays, threads=t, out=target)
+        jobs[f"limit, {mark}"] = lambda t=threads: limit.composite(*arrays, threads=t)
         jobs[f"composite, {mark}"] = with_threads(threads, lambda: composite(lists, camera, SETTINGS, None, False))
         stages: dict[str, Job] = {
             "project": lambda: tiles.project(gaussians, camera, SETTINGS),
@@ -89,7 +92,7 @@ def forward(count: int, cores: int, rounds: int) -> dict[str, float]:
         }
         jobs |= {f"{name}, {mark}": with_threads(threads, job) for name, job in stages.items()}
     times = fastest(jobs, rounds)
-    times["scalar, 1 thread"] = fastest({"scalar": lambda: scalar.composite(*arrays, out=target)}, 2)["scalar"]
+    times["scalar, 1 thread"] = fastest({"scalar": lambda: scalar.composite(*arrays)}, 2)["scalar"]
     times["intersections"] = lists.intersections
     return times
 

@@ -104,6 +104,11 @@ class Gaussians:
         flat = (self.means, self.quats, self.scales, self.opacities[:, None], self.sh.flatten(1))
         return torch.stack([torch.isfinite(f).all(dim=1) for f in flat]).all(dim=0)
 
+    @cached_property
+    def colors_may_be_non_finite(self) -> bool:
+        """Whether some colour coefficient might hold NaN or infinity; one sum over them tells, in one pass."""
+        return not bool(torch.isfinite(self.sh.detach().sum()))
+
     @property
     def non_finite(self) -> int:
         """How many rows hold NaN or infinity; the renderer leaves them out."""

@@ -118,6 +118,8 @@ def project(gaussians: Gaussians, camera: Camera, settings: RasterSettings) -> P
     ]
     outputs = [splats, view(status, wp.uint8), view(depths, wp.float32)]
     launch(projection.project_gaussians, n, inputs, outputs, device=device)
+    if gaussians.colors_may_be_non_finite:  # the kernel reads geometry and opacity only
+        status.masked_fill_(~gaussians.finite, int(projection.NON_FINITE))
     return Projected(splats, status, depths)
 
 

@@ -202,7 +202,7 @@ def test_bad_gaussians_are_left_out_and_counted(make_scene):
     quats[2] = 0.0
     quats[3, 0] = math.nan
     scales[4, 0] = math.inf
-    scales[5, 2] = math.nan
+    sh[5] = math.nan  # colour alone: its geometry is sound
     spoiled = Gaussians(
         *(
             torch.cat(pair)
