@@ -71,10 +71,11 @@ def tile_columns(splat: Splat, q: float, summit: float, row: int, width: int):
 
 @wp.func
 def row_columns(splat: Splat, q: float, summit: float, row: int, width: int, box_first: int, box_last: int):
-    """`tile_columns`, without its square roots where the bounding box is one tile wide."""
+    """`tile_columns`, without its square roots where the bounding box is one tile wide and not cut by the image."""
     first = box_first
     last = box_last
-    if box_first < box_last:
+    cut = splat.mean[0] < splat.half_width or splat.mean[0] + splat.half_width > float(width)
+    if box_first < box_last or cut:
         first, last = tile_columns(splat, q, summit, row, width)
     return first, last
 
