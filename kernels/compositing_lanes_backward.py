@@ -17,8 +17,9 @@ from functools import cache
 
 import warp as wp
 
-from sgwarp.kernels.binning import TILE, Fragment
+from sgwarp.kernels.binning import TILE, fragment_of
 from sgwarp.kernels.compositing_lanes import lane_alphas, row_is_reached
+from sgwarp.kernels.gaussian import Splat
 from sgwarp.kernels.projection import Knobs
 from sgwarp.kernels.transmittance import HALF_ROW, LANE_OFFSETS, LANE_OPTIONS, LANES, Lanes
 
@@ -92,7 +93,8 @@ def make_composite_backward(wide: bool, depth: bool, absolute: bool) -> wp.Kerne
         base: int,  # first tile of this launch
         slot: int,  # scratch of this launch
         offsets: wp.array[int],  # [tiles + 1]
-        fragments: wp.array[Fragment],  # [I]
+        listed: wp.array[int],  # [I]
+        splats: wp.array[Splat],  # [V]
         features: wp.array3d[Lanes],  # [N, S, 1] channels in slices of 16 (wide)
         pixels: wp.array3d[Lanes],  # [H, tile columns, 3] transmittance, its gradient, last contributing fragment
         gradient: wp.array3d[Lanes],  # [H, tile columns, padded C (+ 1)] gradient of the image (and depth sum)
@@ -103,12 +105,13 @@ def make_composite_backward(wide: bool, depth: bool, absolute: bool) -> wp.Kerne
         reach: wp.array2d[int],  # [slots, 16] scratch: last contributing fragment of each row
         sums: wp.array3d[Lanes],  # [slots, BATCH, SUMS] scratch: rows of a batch before the lanes are summed
         # Out:
-        rows_out: wp.array[Lanes],  # [I] by intersection, column q in lane q
+        rows_out: wp.array[Lanes],  # [I] by place, column q in lane q
     ):
         """Paper eq. 1, differentiated, for one tile per thread."""
         tile = base + wp.tid()
         columns = (width + TILE - 1) / TILE
         column = tile % columns
+        x0 = column * TILE
         y0 = (tile / columns) * TILE
         tile_reach = int(-1)
         for row in range(TILE):
@@ -121,13 +124,13 @@ def make_composite_backward(wide: bool, depth: bool, absolute: bool) -> wp.Kerne
             tile_reach = wp.max(tile_reach, row_reach)
         first = offsets[tile]
         for k in range(first + tile_reach + 1, offsets[tile + 1]):
-            rows_out[fragments[k].entry] = Lanes(0.0)
+            rows_out[k] = Lanes(0.0)
         for done in range(0, tile_reach + 1, BATCH):
             newest = tile_reach - done  # counted from the tile's first fragment, as all orders here
             size = wp.min(BATCH, newest + 1)
             for b in range(size):
                 order = newest - b
-                f = fragments[first + order]
+                f = fragment_of(splats, listed[first + order], x0, y0)
                 ramp = f.a * LANE_OFFSETS
                 g0 = Lanes(0.0)
                 gu = Lanes(0.0)
@@ -220,7 +223,6 @@ def make_composite_backward(wide: bool, depth: bool, absolute: bool) -> wp.Kerne
                     other = wp.min(2 * p + 1, quads - 1)
                     sums[slot, b, ROW + p] = fold_2(sums[slot, b, 2 * p], sums[slot, b, other])
             for b in range(size):
-                entry = fragments[first + newest - b].entry
-                rows_out[entry] = fold_1(sums[slot, b, ROW], sums[slot, b, ROW + 1])
+                rows_out[first + newest - b] = fold_1(sums[slot, b, ROW], sums[slot, b, ROW + 1])
 
     return composite_backward

@@ -10,7 +10,7 @@ from functools import cache
 
 import warp as wp
 
-from sgwarp.kernels.binning import TILE, Fragment
+from sgwarp.kernels.binning import TILE, fragment_of
 from sgwarp.kernels.compositing_lanes import (
     CLOSE_EVERY,
     lane_alphas,
@@ -21,6 +21,7 @@ from sgwarp.kernels.compositing_lanes import (
     row_is_reached,
     still_open,
 )
+from sgwarp.kernels.gaussian import Splat
 from sgwarp.kernels.projection import Knobs
 from sgwarp.kernels.transmittance import LANE_OPTIONS, LANES, LaneIds, Lanes
 
@@ -56,7 +57,8 @@ def make_lift_dense(slices: int) -> wp.Kernel:
         base: int,  # first tile of this launch
         slot: int,  # scratch of this launch
         offsets: wp.array[int],  # [tiles + 1]
-        fragments: wp.array[Fragment],  # [I]
+        listed: wp.array[int],  # [I]
+        splats: wp.array[Splat],  # [V]
         features: wp.array3d[Lanes],  # [H, W, S] channels in slices of 16
         valid: wp.array3d[Lanes],  # [H, tile columns, 1] 1 where the pixel carries semantics, else 0
         first_slice: int,  # of this pass
@@ -65,7 +67,7 @@ def make_lift_dense(slices: int) -> wp.Kernel:
         height: int,
         state: wp.array3d[Lanes],  # [slots, 16, 1] scratch
         # Out:
-        rows_out: wp.array2d[Lanes],  # [I, slices] sum over the tile's pixels of alpha T f, by intersection
+        rows_out: wp.array2d[Lanes],  # [I, slices] sum over the tile's pixels of alpha T f, by place
         weights_out: wp.array[float],  # [I] sum of alpha T over the pixels that carry semantics
     ):
         """A^T f for one tile per thread."""
@@ -80,7 +82,7 @@ def make_lift_dense(slices: int) -> wp.Kernel:
         open_rows = open_row_mask(y0, height)
         first = offsets[tile]
         for k in range(first, offsets[tile + 1]):
-            f = fragments[k]
+            f = fragment_of(splats, listed[k], x0, y0)
             sum0 = Lanes(0.0)
             sum1 = Lanes(0.0)
             sum2 = Lanes(0.0)
@@ -112,13 +114,13 @@ def make_lift_dense(slices: int) -> wp.Kernel:
                             sum2 += w[i] * features[y, x0 + i, first_slice + 2]
                             sum3 += w[i] * features[y, x0 + i, first_slice + 3]
             if wp.static(slices == 1):
-                rows_out[f.entry, 0] = (sum0 + sum1) + (sum2 + sum3)
+                rows_out[k, 0] = (sum0 + sum1) + (sum2 + sum3)
             else:
-                rows_out[f.entry, 0] = sum0
-                rows_out[f.entry, 1] = sum1
-                rows_out[f.entry, 2] = sum2
-                rows_out[f.entry, 3] = sum3
-            weights_out[f.entry] = lane_sum(weight)
+                rows_out[k, 0] = sum0
+                rows_out[k, 1] = sum1
+                rows_out[k, 2] = sum2
+                rows_out[k, 3] = sum3
+            weights_out[k] = lane_sum(weight)
             if (k - first) % CLOSE_EVERY == CLOSE_EVERY - 1:
                 open_rows = still_open(open_rows, state, slot)
 
@@ -131,7 +133,8 @@ def lift_ids(
     base: int,
     slot: int,
     offsets: wp.array[int],  # [tiles + 1]
-    fragments: wp.array[Fragment],  # [I]
+    listed: wp.array[int],  # [I]
+    splats: wp.array[Splat],  # [V]
     local_ids: wp.array2d[LaneIds],  # [tiles, 16] place of each pixel's id in its tile's list, -1 = none
     uniform: wp.array2d[int],  # [tiles, 16] the local id if the whole row shares it, else -2
     row_starts: wp.array[int],  # [tiles + 1] first weight of each tile
@@ -141,7 +144,7 @@ def lift_ids(
     state: wp.array3d[Lanes],  # [slots, 16, 1] scratch
     # Out:
     weights_out: wp.array[float],  # zeroed; per fragment one weight for each id of its tile
-    starts_out: wp.array[int],  # [I] first weight of each intersection, by Gaussian
+    starts_out: wp.array[int],  # [I] first weight of each intersection, by place
 ):
     """Sum of alpha T by id: the cost does not depend on the number of feature channels."""
     tile = base + wp.tid()
@@ -159,9 +162,9 @@ def lift_ids(
         if uniform[tile, row] != 0:
             plain = False
     for k in range(first, offsets[tile + 1]):
-        f = fragments[k]
+        f = fragment_of(splats, listed[k], x0, y0)
         place = row_starts[tile] + (k - first) * ids
-        starts_out[f.entry] = place
+        starts_out[k] = place
         if plain:
             total = Lanes(0.0)
             for row in range(f.first_row, f.last_row + 1):

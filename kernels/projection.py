@@ -11,6 +11,7 @@ from sgwarp.kernels.gaussian import (
     Splat,
     camera_from_world,
     factor_determinant,
+    footprint_summit,
     projected_factor,
 )
 
@@ -111,10 +112,11 @@ def project_gaussians(
     splat.c = unit / wp.sqrt(yy)
     splat.level = wp.log2(opacity)
     splat.depth = point[2]
-    q = splat.level - knobs.alpha_min_level + LEVEL_SLACK
-    reach = wp.sqrt(q) / unit
-    splat.half_width = reach * wp.sqrt(xx)
-    splat.half_height = reach * wp.sqrt(yy)
+    splat.reach = splat.level - knobs.alpha_min_level + LEVEL_SLACK
+    sigmas = wp.sqrt(splat.reach) / unit
+    splat.half_width = sigmas * wp.sqrt(xx)
+    splat.half_height = sigmas * wp.sqrt(yy)
+    splat.summit = footprint_summit(splat)
     x = splat.mean[0]
     y = splat.mean[1]
     inside = x + splat.half_width >= 0.5 and x - splat.half_width <= float(camera.width) - 0.5

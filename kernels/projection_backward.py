@@ -34,7 +34,8 @@ def sum_intersections(
     base: int,  # first entry of `order` in this launch
     order: wp.array[int],  # [V] Gaussians
     entries: wp.array[int],  # [V + 1] first intersection of each
-    rows: wp.array[Lanes],  # [I] by intersection
+    places: wp.array[int],  # [I] where each intersection stands in the tile lists
+    rows: wp.array[Lanes],  # [I] by place
     # Out:
     sums_out: wp.array[Lanes],  # [N] zeroed
 ):
@@ -44,9 +45,9 @@ def sum_intersections(
     last = entries[k + 1]
     if first == last:
         return
-    total = rows[first]
+    total = rows[places[first]]
     for e in range(first + 1, last):
-        total += rows[e]
+        total += rows[places[e]]
     total[SEEN] = 1.0
     sums_out[order[k]] = total
 

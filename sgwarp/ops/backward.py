@@ -86,8 +86,8 @@ def composite_backward(
     """Differentiate `composite_recorded`.
 
     Args:
-        lists: Kept tile lists of the view.
-        features: What was composited if it did not travel with the fragments, [N, C].
+        lists: Kept tile lists of the view, with places.
+        features: What was composited if it did not travel with the splats, [N, C].
         channels: Of the image.
         recorded: Transmittance, `last` and `hit` as compositing returned them.
         gradients: Of the loss.
@@ -110,7 +110,7 @@ def composite_backward(
     sums = torch.zeros(count, LANE, device=device)
     rows = scratch("backward rows", lists.intersections * LANE if ordered else 0, torch.float32, device).view(-1, LANE)
     slices = in_slices(features if wide and features is not None else zeros[:1, :1])
-    head = [view(lists.offsets, wp.int32), lists.fragments]
+    head = lists.arrays()
     size = [tiles.knobs(settings), camera.width, camera.height]
     if block:
         maps = [view(t.contiguous(), wp.float32) for t in (transmittance, v_transmittance, v_image, v_depth)]
@@ -138,12 +138,12 @@ def composite_backward(
         kernel = compositing_lanes_backward.make_composite_backward(wide, depth, absolute)
         launch(kernel, lists.tile_count, [*inputs, *scratches], [view(rows, Lanes)], device=device, slots=True)
     if ordered:
-        inputs = [view(lists.order, wp.int32), view(lists.entries, wp.int32), view(rows, Lanes)]
-        outputs = [view(sums, Lanes)]
-        launch(kernels.sum_intersections, len(lists.order), inputs, outputs, device=device)
+        inputs = [*lists.sums(), view(rows, Lanes)]
+        launch(kernels.sum_intersections, len(lists.order), inputs, [view(sums, Lanes)], device=device)
     if gradients.surface is not None:
-        seen = hit >= 0
-        sums[:, at_depth].index_add_(0, hit[seen].to(torch.int64), gradients.surface[seen])
+        # Pixels without a surface add zero to the first Gaussian: choosing the others would wait for the device.
+        at_hit = torch.where(hit >= 0, gradients.surface, 0.0).flatten()
+        sums[:, at_depth].index_add_(0, hit.clamp(min=0).flatten().to(torch.int64), at_hit)
     if not wide:
         v_features = sums[:, MOMENTS : MOMENTS + channels]
     else:
@@ -256,24 +256,23 @@ def shade_backward(
 
 
 def pose_gradient(camera: Camera, poses: Tensor, v_offsets: Tensor | None) -> Tensor:
-    """Gradient of the world-to-camera matrix, float64 [4, 4] on the CPU, from every Gaussian's share.
+    """Gradient of the world-to-camera matrix, float64 [4, 4], from every Gaussian's share.
 
     Args:
         poses: Of the rotation about the camera's centre and of the translation, [N, 12].
         v_offsets: Of each centre seen from the camera's, [N, 3], where colours depend on the direction.
     """
-    total = _sum_rows(poses).cpu()
+    total = _sum_rows(poses)
     v_translation = total[9:]
-    center = camera.position
-    gradient = torch.zeros(4, 4, dtype=torch.float64)
+    pose, center = camera.world_to_camera.to(poses.device), camera.position.to(poses.device)
+    gradient = torch.zeros(4, 4, dtype=torch.float64, device=poses.device)
     # p = R m + t, and m = (m - center) + center.
     gradient[:3, :3] = total[:9].view(3, 3) + torch.outer(v_translation, center)
     gradient[:3, 3] = v_translation
     if v_offsets is not None:
-        v_center = -_sum_rows(v_offsets).cpu()
-        rotation, translation = camera.world_to_camera[:3, :3], camera.world_to_camera[:3, 3]
-        gradient[:3, :3] -= torch.outer(translation, v_center)
-        gradient[:3, 3] -= rotation @ v_center
+        v_center = -_sum_rows(v_offsets)
+        gradient[:3, :3] -= torch.outer(pose[:3, 3], v_center)
+        gradient[:3, 3] -= pose[:3, :3] @ v_center
     return gradient
 
 

@@ -151,13 +151,13 @@ class _Rasterize(torch.autograd.Function):
         projected = tiles.project(gaussians, camera, settings)
         order = tiles.depth_order(projected)
         colors = packed_colors(gaussians, camera, features, order, settings)
-        lists = tiles.bin_splats(projected, order, colors, camera, settings, keep=True)
+        lists = tiles.bin_splats(projected, order, colors, camera, places=True, keep=True)
         image, transmittance, depth_sum, surface, last, hit = composite_recorded(
             lists, camera, settings, features, request.wants_depth, request.schedule
         )
         request.culled = projected.culled()
-        kept = (lists.order, lists.entries, lists.offsets, lists.memory, transmittance, last, hit)
-        ctx.save_for_backward(means, quats, scales, opacities, values, viewmat, *kept)
+        recorded = (transmittance, last, hit)
+        ctx.save_for_backward(means, quats, scales, opacities, values, viewmat, *recorded, *vars(lists).values())
         ctx.request = request
         ctx.channels = image.shape[2]
         ctx.set_materialize_grads(False)
@@ -174,18 +174,16 @@ class _Rasterize(torch.autograd.Function):
     ) -> tuple[Tensor | None, ...]:
         request: _Request = ctx.request
         camera, settings = request.camera, request.settings
-        means, quats, scales, opacities, values, viewmat, order, entries, offsets, memory, *recorded = ctx.saved_tensors
+        means, quats, scales, opacities, values, viewmat, *kept = ctx.saved_tensors
         gaussians = _gaussians(means, quats, scales, opacities, values, request)
-        fragments = tiles.as_fragments(memory)
-        nothing = order[:0]
-        lists = tiles.TileLists(order, entries, offsets, fragments, fragments.size, nothing, nothing, memory)
+        recorded, lists = (kept[0], kept[1], kept[2]), tiles.TileLists(*kept[3:])
         splats = backward.composite_backward(
             lists,
             camera,
             settings,
             None if request.harmonics else values,
             ctx.channels,
-            tuple(recorded),
+            recorded,
             backward.ImageGradients(v_image, v_transmittance, v_depth_sum, v_surface),
             len(means),
             absolute=request.receives_absgrad is not None,
