@@ -92,6 +92,29 @@ def prefetch(splats: wp.array[Splat], i: int): ...
 
 
 @wp.func
+def row_range(splats: wp.array[Splat], rank: int, x: float):
+    """First and last dy of the footprint on a tile's 16 columns of pixel centres, the first of which lies x before it.
+
+    The lower border dy(dx) = (-a b dx + a c sqrt(w^2 - dx^2)) / (b^2 + c^2), w the half width, is concave: see
+    `column_range`.
+    """
+    a = splats[rank].a
+    b = splats[rank].b
+    c = splats[rank].c
+    half_width = splats[rank].half_width
+    lo = wp.max(-x, -half_width)
+    hi = wp.min(float(TILE - 1) - x, half_width)
+    summit = -b * splats[rank].half_height / a
+    at_bottom = wp.clamp(summit, lo, hi)
+    at_top = wp.clamp(-summit, lo, hi)
+    unit = a / (b * b + c * c)
+    w2 = half_width * half_width
+    bottom = (c * wp.sqrt(wp.max(w2 - at_bottom * at_bottom, 0.0)) - b * at_bottom) * unit
+    top = (-c * wp.sqrt(wp.max(w2 - at_top * at_top, 0.0)) - b * at_top) * unit
+    return top, bottom
+
+
+@wp.func
 def fragment_of(splats: wp.array[Splat], rank: int, x0: int, y0: int) -> Fragment:
     """A splat relative to the tile whose first pixel is (x0, y0). Fields are read one by one: a copy would cost more."""
     fragment = Fragment()
@@ -103,9 +126,9 @@ def fragment_of(splats: wp.array[Splat], rank: int, x0: int, y0: int) -> Fragmen
     fragment.level = splats[rank].level
     fragment.depth = splats[rank].depth
     fragment.gaussian = splats[rank].gaussian
-    half_height = splats[rank].half_height
-    fragment.first_row = int(wp.ceil(wp.clamp(fragment.y - half_height, 0.0, float(TILE))))
-    fragment.last_row = int(wp.floor(wp.clamp(fragment.y + half_height, -1.0, float(TILE - 1))))
+    top, bottom = row_range(splats, rank, fragment.x)
+    fragment.first_row = int(wp.ceil(wp.clamp(fragment.y + top, 0.0, float(TILE))))
+    fragment.last_row = int(wp.floor(wp.clamp(fragment.y + bottom, -1.0, float(TILE - 1))))
     fragment.color = splats[rank].color
     return fragment
 

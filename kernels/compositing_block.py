@@ -63,7 +63,7 @@ def pixel_walk(depth: bool, record: bool) -> wp.Function:
         stop = offsets[tile + 1]
         for start in range(first, stop, STAGE):
             ranks = wp.tile_load(listed, shape=STAGE, offset=start, storage="shared")
-            staged = wp.tile_load_indexed(splats, indices=ranks, shape=STAGE, storage="shared")
+            staged = wp.tile_load_indexed(splats, indices=ranks, shape=(STAGE,), storage="shared")
             for j in range(wp.min(STAGE, stop - start)):
                 f = staged[j]
                 alpha = alpha_at(f, x, y, knobs)
@@ -161,7 +161,7 @@ def feature_pixel_walk(record: bool) -> wp.Function:
         stop = offsets[tile + 1]
         for start in range(first, stop, STAGE):
             ranks = wp.tile_load(listed, shape=STAGE, offset=start, storage="shared")
-            staged = wp.tile_load_indexed(splats, indices=ranks, shape=STAGE, storage="shared")
+            staged = wp.tile_load_indexed(splats, indices=ranks, shape=(STAGE,), storage="shared")
             for j in range(wp.min(STAGE, stop - start)):
                 f = staged[j]
                 alpha = alpha_at(f, x, y, knobs)

@@ -94,7 +94,7 @@ def make_composite_backward_block(wide: bool, depth: bool, absolute: bool, order
             size = count - done - start
             # The barriers of this load and of the assignments below keep readers and writers of `shares` apart.
             ranks = wp.tile_load(listed, shape=BATCH, offset=first + start, storage="shared")
-            staged = wp.tile_load_indexed(splats, indices=ranks, shape=BATCH, storage="shared")
+            staged = wp.tile_load_indexed(splats, indices=ranks, shape=(BATCH,), storage="shared")
             values = Lanes(0.0)
             if wp.static(wide) and inside:
                 for s in range(features.shape[1]):

@@ -133,7 +133,7 @@ def color_walk(depth: bool, record: bool) -> wp.Function:
             prefetch(splats, listed[wp.min(k + AHEAD, stop - 1)])
             f = fragment_of(splats, listed[k], x0, y0)
             for row in range(f.first_row, f.last_row + 1):
-                if row_is_reached(f, row, knobs) and (open_rows >> row) & 1 != 0:
+                if (open_rows >> row) & 1 != 0:
                     T = state[slot, row, 0]
                     alphas = lane_alphas(f, row, knobs)
                     w = lane_contributions(alphas, T, knobs)

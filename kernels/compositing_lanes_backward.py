@@ -10,6 +10,10 @@ alpha = 2^(level - u^2 - v^2) again by the forward's own device functions. What 
 g = w (c - B) under 1, u, v, u^2, u v, v^2. In these whitened coordinates the moments stay of order one, so that needles
 lose no digits on the way back to three dimensions (`projection_backward.py`).
 
+Along a row only u changes, and from row to row u and v change by b and c. So a row adds g, d g and d^2 g to three
+vectors, d its distance to the middle one of the rows at work, and the six moments follow once per fragment. Counted
+from the middle, d b stays as small as a tile, and nothing large cancels.
+
 The thread that owns a tile writes one row per intersection, so no two threads write the same memory.
 """
 
@@ -17,8 +21,8 @@ from functools import cache
 
 import warp as wp
 
-from sgwarp.kernels.binning import TILE, fragment_of
-from sgwarp.kernels.compositing_lanes import lane_alphas, row_is_reached
+from sgwarp.kernels.binning import AHEAD, TILE, fragment_of, prefetch
+from sgwarp.kernels.compositing_lanes import lane_alphas
 from sgwarp.kernels.gaussian import Splat
 from sgwarp.kernels.projection import Knobs
 from sgwarp.kernels.transmittance import HALF_ROW, LANE_OFFSETS, LANE_OPTIONS, LANES, Lanes
@@ -30,6 +34,7 @@ MOST_COLUMNS = 12
 ROW = wp.constant(MOST_COLUMNS)
 SUMS = MOST_COLUMNS + MOST_COLUMNS // 2  # vectors of scratch per fragment: two levels of the tree that sums the lanes
 MOMENTS = 6  # columns of a row: the moments of g, then colours, depth, |d mean| where they are asked for
+GRADIENT = wp.constant(3)  # first plane of the scratch that holds the image's gradient
 BATCH = wp.constant(16)  # fragments whose values under the gradient are computed at a time
 
 
@@ -59,7 +64,7 @@ def make_fold(half: int) -> wp.Function:
 
 @wp.func
 def feature_value(
-    features: wp.array3d[Lanes], gaussian: int, gradient: wp.array3d[Lanes], y: int, column: int, slices: int
+    features: wp.array3d[Lanes], gaussian: int, state: wp.array3d[Lanes], slot: int, row: int, slices: int
 ) -> Lanes:
     """sum_i x_i v_i at the 16 pixels of a row, over all slices of channels."""
     even = Lanes(0.0)  # two sums in turn: one alone would wait for its own last addition
@@ -67,9 +72,22 @@ def feature_value(
     for s in range(slices):
         x = features[gaussian, s, 0]
         for c in range(0, LANES, 2):
-            even += x[c] * gradient[y, column, LANES * s + c]
-            odd += x[c + 1] * gradient[y, column, LANES * s + c + 1]
+            even += x[c] * state[slot, row, GRADIENT + LANES * s + c]
+            odd += x[c + 1] * state[slot, row, GRADIENT + LANES * s + c + 1]
     return even + odd
+
+
+@wp.func
+def read_lanes(image: wp.array2d[float], y: int, first: int, stride: int, inside: int, outside: float) -> Lanes:
+    """Numbers of 16 neighbouring pixels, `stride` apart; those beyond the image's edge are `outside`."""
+    values = Lanes(outside)
+    if inside == LANES:
+        for i in range(LANES):
+            values[i] = image[y, first + i * stride]
+    else:
+        for i in range(inside):
+            values[i] = image[y, first + i * stride]
+    return values
 
 
 @cache
@@ -77,8 +95,8 @@ def make_composite_backward(wide: bool, depth: bool, absolute: bool) -> wp.Kerne
     """Kernel that differentiates compositing.
 
     Args:
-        wide: The values are `features` of any number of channels instead of the fragments' three colours; gradients
-            with respect to features are not computed here: they are the image's gradient, lifted.
+        wide: The values are `features` of any number of channels instead of the splats' three colours; gradients with
+            respect to features are not computed here: they are the image's gradient, lifted.
         depth: The sum of alpha T z has a gradient too; it is the plane after the channels.
         absolute: Also sum the magnitudes of each pixel's gradient of the projected mean.
     """
@@ -96,13 +114,16 @@ def make_composite_backward(wide: bool, depth: bool, absolute: bool) -> wp.Kerne
         listed: wp.array[int],  # [I]
         splats: wp.array[Splat],  # [V]
         features: wp.array3d[Lanes],  # [N, S, 1] channels in slices of 16 (wide)
-        pixels: wp.array3d[Lanes],  # [H, tile columns, 3] transmittance, its gradient, last contributing fragment
-        gradient: wp.array3d[Lanes],  # [H, tile columns, padded C (+ 1)] gradient of the image (and depth sum)
+        transmittance: wp.array2d[float],  # [H, W]
+        v_transmittance: wp.array2d[float],  # [H, W] its gradient
+        v_image: wp.array2d[float],  # [H, W C] gradient of the image
+        v_depth: wp.array2d[float],  # [H, W] gradient of the depth sum (depth)
+        last: wp.array2d[float],  # [H, W] last contributor, counted from its tile's first, -1 = none
         knobs: Knobs,
         width: int,
         height: int,
-        state: wp.array3d[Lanes],  # [slots, 16, 2] scratch: transmittance, value behind
-        reach: wp.array2d[int],  # [slots, 16] scratch: last contributing fragment of each row
+        state: wp.array3d[Lanes],  # [slots, 16, 3 + padded C (+ 1)] scratch: transmittance, value behind, last, gradient
+        reach: wp.array2d[int],  # [slots, 16] scratch: last contributor of each row
         sums: wp.array3d[Lanes],  # [slots, BATCH, SUMS] scratch: rows of a batch before the lanes are summed
         # Out:
         rows_out: wp.array[Lanes],  # [I] by place, column q in lane q
@@ -110,34 +131,42 @@ def make_composite_backward(wide: bool, depth: bool, absolute: bool) -> wp.Kerne
         """Paper eq. 1, differentiated, for one tile per thread."""
         tile = base + wp.tid()
         columns = (width + TILE - 1) / TILE
-        column = tile % columns
-        x0 = column * TILE
+        x0 = (tile % columns) * TILE
         y0 = (tile / columns) * TILE
+        inside = wp.min(LANES, width - x0)
+        channels = v_image.shape[1] / width
         tile_reach = int(-1)
         for row in range(TILE):
             row_reach = int(-1)
-            if y0 + row < height:
-                state[slot, row, 0] = pixels[y0 + row, column, 0]
-                state[slot, row, 1] = pixels[y0 + row, column, 1]
-                row_reach = int(wp.max(pixels[y0 + row, column, 2]))
+            y = y0 + row
+            if y < height:
+                state[slot, row, 0] = read_lanes(transmittance, y, x0, 1, inside, 1.0)
+                state[slot, row, 1] = read_lanes(v_transmittance, y, x0, 1, inside, 0.0)
+                state[slot, row, 2] = read_lanes(last, y, x0, 1, inside, -1.0)
+                for c in range(channels):
+                    state[slot, row, GRADIENT + c] = read_lanes(v_image, y, x0 * channels + c, channels, inside, 0.0)
+                for c in range(channels, state.shape[2] - GRADIENT):
+                    state[slot, row, GRADIENT + c] = Lanes(0.0)
+                if wp.static(depth):
+                    state[slot, row, state.shape[2] - 1] = read_lanes(v_depth, y, x0, 1, inside, 0.0)
+                row_reach = int(wp.max(state[slot, row, 2]))
             reach[slot, row] = row_reach
             tile_reach = wp.max(tile_reach, row_reach)
         first = offsets[tile]
         for k in range(first + tile_reach + 1, offsets[tile + 1]):
             rows_out[k] = Lanes(0.0)
         for done in range(0, tile_reach + 1, BATCH):
-            newest = tile_reach - done  # counted from the tile's first fragment, as all orders here
+            newest = tile_reach - done  # counted from the tile's first, as all orders here
             size = wp.min(BATCH, newest + 1)
             for b in range(size):
                 order = newest - b
+                prefetch(splats, listed[first + wp.max(order - AHEAD, 0)])
                 f = fragment_of(splats, listed[first + order], x0, y0)
                 ramp = f.a * LANE_OFFSETS
+                middle_row = float((f.first_row + f.last_row) / 2)
                 g0 = Lanes(0.0)
-                gu = Lanes(0.0)
-                gv = Lanes(0.0)
-                guu = Lanes(0.0)
-                guv = Lanes(0.0)
-                gvv = Lanes(0.0)
+                g1 = Lanes(0.0)
+                g2 = Lanes(0.0)
                 red = Lanes(0.0)
                 green = Lanes(0.0)
                 blue = Lanes(0.0)
@@ -146,59 +175,61 @@ def make_composite_backward(wide: bool, depth: bool, absolute: bool) -> wp.Kerne
                 down = Lanes(0.0)
                 for row in range(f.first_row, f.last_row + 1):
                     # Leaving early keeps the sums in registers: after an `if` Warp selects them through memory.
-                    if order > reach[slot, row] or not row_is_reached(f, row, knobs):
+                    if order > reach[slot, row]:
                         continue
-                    y = y0 + row
                     alphas = lane_alphas(f, row, knobs)
-                    last = pixels[y, column, 2]
+                    last_order = state[slot, row, 2]
                     T = state[slot, row, 0]
                     behind = state[slot, row, 1]
                     for i in range(LANES):
-                        alphas[i] = wp.where(float(order) <= last[i], alphas[i], 0.0)
+                        alphas[i] = wp.where(float(order) <= last_order[i], alphas[i], 0.0)
                         T[i] = T[i] / wp.max(1.0 - alphas[i], MIN_PASSED)
                     w = wp.cw_mul(alphas, T)
                     value = Lanes(0.0)
                     if wp.static(wide):
-                        value = feature_value(features, f.gaussian, gradient, y, column, features.shape[1])
+                        value = feature_value(features, f.gaussian, state, slot, row, features.shape[1])
                     else:
-                        value = f.color[0] * gradient[y, column, 0]
-                        value += f.color[1] * gradient[y, column, 1]
-                        value += f.color[2] * gradient[y, column, 2]
-                        red += wp.cw_mul(w, gradient[y, column, 0])
-                        green += wp.cw_mul(w, gradient[y, column, 1])
-                        blue += wp.cw_mul(w, gradient[y, column, 2])
+                        value = f.color[0] * state[slot, row, GRADIENT]
+                        value += f.color[1] * state[slot, row, GRADIENT + 1]
+                        value += f.color[2] * state[slot, row, GRADIENT + 2]
+                        red += wp.cw_mul(w, state[slot, row, GRADIENT])
+                        green += wp.cw_mul(w, state[slot, row, GRADIENT + 1])
+                        blue += wp.cw_mul(w, state[slot, row, GRADIENT + 2])
                     if wp.static(depth):
-                        v_depth = gradient[y, column, gradient.shape[2] - 1]
-                        value += f.depth * v_depth
-                        z += wp.cw_mul(w, v_depth)
+                        v_sum = state[slot, row, state.shape[2] - 1]
+                        value += f.depth * v_sum
+                        z += wp.cw_mul(w, v_sum)
                     excess = value - behind
                     state[slot, row, 0] = T
                     state[slot, row, 1] = behind + wp.cw_mul(alphas, excess)
                     g = wp.cw_mul(w, excess)
-                    dy = float(row) - f.y
-                    v = f.c * dy
-                    middle = f.b * dy + f.a * (HALF_ROW - f.x)
-                    u = ramp
                     for i in range(LANES):
                         g[i] = wp.where(alphas[i] < knobs.alpha_max, g[i], 0.0)
-                        u[i] = ramp[i] + middle
-                    first_moment = wp.cw_mul(g, u)
+                    d = float(row) - middle_row
                     g0 += g
-                    gu += first_moment
-                    gv += v * g
-                    guu += wp.cw_mul(first_moment, u)
-                    guv += v * first_moment
-                    gvv += (v * v) * g
+                    g1 += d * g
+                    g2 += (d * d) * g
                     if wp.static(absolute):
+                        dy = float(row) - f.y
+                        middle = f.b * dy + f.a * (HALF_ROW - f.x)
                         for i in range(LANES):
-                            across[i] = across[i] + wp.abs(f.a * first_moment[i])
-                            down[i] = down[i] + wp.abs(f.b * first_moment[i] + f.c * v * g[i])
+                            g_u = g[i] * (ramp[i] + middle)
+                            across[i] = across[i] + wp.abs(f.a * g_u)
+                            down[i] = down[i] + wp.abs(f.b * g_u + f.c * f.c * dy * g[i])
+                v = f.c * (middle_row - f.y)
+                u = ramp
+                middle = f.b * (middle_row - f.y) + f.a * (HALF_ROW - f.x)
+                for i in range(LANES):
+                    u[i] = ramp[i] + middle
+                gu = wp.cw_mul(u, g0) + f.b * g1
+                gv = v * g0 + f.c * g1
+                gu1 = wp.cw_mul(u, g1) + f.b * g2
                 sums[slot, b, 0] = g0
                 sums[slot, b, 1] = gu
                 sums[slot, b, 2] = gv
-                sums[slot, b, 3] = guu
-                sums[slot, b, 4] = guv
-                sums[slot, b, 5] = gvv
+                sums[slot, b, 3] = wp.cw_mul(u, gu) + f.b * gu1
+                sums[slot, b, 4] = v * gu + f.c * gu1
+                sums[slot, b, 5] = v * gv + f.c * (v * g1 + f.c * g2)
                 if wp.static(not wide):
                     sums[slot, b, 6] = red
                     sums[slot, b, 7] = green

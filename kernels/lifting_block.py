@@ -64,7 +64,7 @@ def make_lift_dense_block(ordered: bool) -> wp.Kernel:
             count = wp.min(BATCH, last - start)
             # The barriers of this load and of the assignment below keep readers and writers of `shares` apart.
             ranks = wp.tile_load(listed, shape=BATCH, offset=start, storage="shared")
-            staged = wp.tile_load_indexed(splats, indices=ranks, shape=BATCH, storage="shared")
+            staged = wp.tile_load_indexed(splats, indices=ranks, shape=(BATCH,), storage="shared")
             weights = Lanes(0.0)
             for b in range(BATCH):
                 if b < count:
@@ -136,7 +136,7 @@ def make_lift_ids_block(ordered: bool) -> wp.Kernel:
             count = wp.min(BATCH, last - start)
             # The barriers of this load and of the assignment below keep readers and writers of `shares` apart.
             ranks = wp.tile_load(listed, shape=BATCH, offset=start, storage="shared")
-            staged = wp.tile_load_indexed(splats, indices=ranks, shape=BATCH, storage="shared")
+            staged = wp.tile_load_indexed(splats, indices=ranks, shape=(BATCH,), storage="shared")
             weights = Lanes(0.0)
             for b in range(BATCH):
                 if b < count:

@@ -10,7 +10,7 @@ from functools import cache
 
 import warp as wp
 
-from sgwarp.kernels.binning import TILE, fragment_of
+from sgwarp.kernels.binning import AHEAD, TILE, fragment_of, prefetch
 from sgwarp.kernels.compositing_lanes import (
     CLOSE_EVERY,
     lane_alphas,
@@ -18,7 +18,6 @@ from sgwarp.kernels.compositing_lanes import (
     lane_contributions,
     open_lanes,
     open_row_mask,
-    row_is_reached,
     still_open,
 )
 from sgwarp.kernels.gaussian import Splat
@@ -81,7 +80,9 @@ def make_lift_dense(slices: int) -> wp.Kernel:
             state[slot, row, 0] = open_lanes(x0, width)
         open_rows = open_row_mask(y0, height)
         first = offsets[tile]
-        for k in range(first, offsets[tile + 1]):
+        stop = offsets[tile + 1]
+        for k in range(first, stop):
+            prefetch(splats, listed[wp.min(k + AHEAD, stop - 1)])
             f = fragment_of(splats, listed[k], x0, y0)
             sum0 = Lanes(0.0)
             sum1 = Lanes(0.0)
@@ -89,7 +90,7 @@ def make_lift_dense(slices: int) -> wp.Kernel:
             sum3 = Lanes(0.0)
             weight = Lanes(0.0)
             for row in range(f.first_row, f.last_row + 1):
-                if row_is_reached(f, row, knobs) and (open_rows >> row) & 1 != 0:
+                if (open_rows >> row) & 1 != 0:
                     T = state[slot, row, 0]
                     alphas = lane_alphas(f, row, knobs)
                     y = y0 + row
@@ -155,20 +156,22 @@ def lift_ids(
         state[slot, row, 0] = open_lanes(x0, width)
     open_rows = open_row_mask(y0, height)
     first = offsets[tile]
-    count = wp.max(offsets[tile + 1] - first, 1)
+    stop = offsets[tile + 1]
+    count = wp.max(stop - first, 1)
     ids = (row_starts[tile + 1] - row_starts[tile]) / count
     plain = ids == 1
     for row in range(TILE):
         if uniform[tile, row] != 0:
             plain = False
-    for k in range(first, offsets[tile + 1]):
+    for k in range(first, stop):
+        prefetch(splats, listed[wp.min(k + AHEAD, stop - 1)])
         f = fragment_of(splats, listed[k], x0, y0)
         place = row_starts[tile] + (k - first) * ids
         starts_out[k] = place
         if plain:
             total = Lanes(0.0)
             for row in range(f.first_row, f.last_row + 1):
-                if row_is_reached(f, row, knobs) and (open_rows >> row) & 1 != 0:
+                if (open_rows >> row) & 1 != 0:
                     T = state[slot, row, 0]
                     alphas = lane_alphas(f, row, knobs)
                     total += lane_contributions(alphas, T, knobs)
@@ -180,7 +183,7 @@ def lift_ids(
         run = int(-1)  # id shared by the rows summed in `total` so far
         total = Lanes(0.0)
         for row in range(f.first_row, f.last_row + 1):
-            if row_is_reached(f, row, knobs) and (open_rows >> row) & 1 != 0:
+            if (open_rows >> row) & 1 != 0:
                 T = state[slot, row, 0]
                 alphas = lane_alphas(f, row, knobs)
                 w = lane_contributions(alphas, T, knobs)

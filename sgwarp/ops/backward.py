@@ -7,11 +7,10 @@ from dataclasses import dataclass
 import torch
 import warp as wp
 from torch import Tensor
-from torch.nn.functional import pad
 
 from sgwarp.kernels import compositing_block_backward, compositing_lanes_backward, harmonics_backward
 from sgwarp.kernels import projection_backward as kernels
-from sgwarp.kernels.compositing_lanes_backward import MOMENTS, SUMS, row_columns
+from sgwarp.kernels.compositing_lanes_backward import GRADIENT, MOMENTS, SUMS, row_columns
 from sgwarp.kernels.transmittance import Lanes
 from sgwarp.ops import tiles
 from sgwarp.ops.launch import get_threads, launch, launch_blocks, scratch, view
@@ -112,29 +111,22 @@ def composite_backward(
     slices = in_slices(features if wide and features is not None else zeros[:1, :1])
     head = lists.arrays()
     size = [tiles.knobs(settings), camera.width, camera.height]
+    maps = [view(t.contiguous(), wp.float32) for t in (transmittance, v_transmittance)]
+    v_maps = [view(t.contiguous(), wp.float32) for t in (v_image if block else v_image.flatten(1), v_depth)]
     if block:
-        maps = [view(t.contiguous(), wp.float32) for t in (transmittance, v_transmittance, v_image, v_depth)]
-        inputs = [*head, view(slices, Lanes), *maps, view(last, wp.int32), *size]
+        inputs = [*head, view(slices, Lanes), *maps, *v_maps, view(last, wp.int32), *size]
         kernel = compositing_block_backward.make_composite_backward_block(wide, depth, absolute, ordered)
         outputs = [view(rows if ordered else sums, wp.float32)]
         launch_blocks(kernel, [lists.tile_count], inputs, outputs, device=device)
     else:
-        shape = (camera.height, -(-camera.width // LANE), -1, LANE)
-        room = shape[0] * shape[1] * LANE
-        pixels = scratch("backward pixels", room * 3, torch.float32, device).view(shape)
-        for plane, (image, outside) in enumerate(((transmittance, 1.0), (v_transmittance, 0.0), (last, -1.0))):
-            _in_lanes(image[..., None], pixels[:, :, plane : plane + 1], outside)
         padded = slices.shape[1] * LANE if wide else 3
-        gradient = scratch("backward gradient", room * (padded + depth), torch.float32, device).view(shape)
-        _in_lanes(v_image, gradient[:, :, :padded])
-        if depth:
-            _in_lanes(v_depth[..., None], gradient[:, :, padded:])
         scratches = [
-            lane_scratch("backward state", TILE_ROWS, 2, device),
+            lane_scratch("backward state", TILE_ROWS, GRADIENT + padded + depth, device),
             view(scratch("reach", get_threads() * TILE_ROWS, torch.int32, device).view(-1, TILE_ROWS), wp.int32),
             lane_scratch("backward sums", LANE, SUMS, device),
         ]
-        inputs = [*head, view(slices.unsqueeze(2), Lanes), view(pixels, Lanes), view(gradient, Lanes), *size]
+        lasts = view(last.to(torch.float32), wp.float32)
+        inputs = [*head, view(slices.unsqueeze(2), Lanes), *maps, *v_maps, lasts, *size]
         kernel = compositing_lanes_backward.make_composite_backward(wide, depth, absolute)
         launch(kernel, lists.tile_count, [*inputs, *scratches], [view(rows, Lanes)], device=device, slots=True)
     if ordered:
@@ -151,20 +143,6 @@ def composite_backward(
     # The kernel leaves out the factor of d(2^x) = ln 2 2^x dx, and that of the square.
     magnitudes = 2.0 * kernels.LN_2 * sums[:, at_absolute : at_absolute + 2] if absolute else None
     return SplatGradients(sums, at_depth if depth else -1, v_features, magnitudes)
-
-
-def _in_lanes(image: Tensor, out: Tensor, outside: float = 0.0) -> None:
-    """Write an image [H, W, C] with 16 pixels of a row in a vector, `out` is [H, tile columns, C or more, 16].
-
-    Pixels beyond its edge are `outside`, channels beyond its last are zero.
-    """
-    _, columns, channels, _ = out.shape
-    height, width, given = image.shape
-    if width % LANE:
-        image = pad(image, (0, 0, 0, columns * LANE - width), value=outside)
-    if given < channels:
-        image = pad(image, (0, channels - given))
-    out.copy_(image.reshape(height, columns, LANE, channels).transpose(2, 3))
 
 
 def _lift_gradient(
