@@ -25,7 +25,7 @@ from sgwarp.kernels.binning import AHEAD, TILE, fragment_of, prefetch
 from sgwarp.kernels.compositing_lanes import lane_alphas
 from sgwarp.kernels.gaussian import Splat
 from sgwarp.kernels.projection import Knobs
-from sgwarp.kernels.transmittance import HALF_ROW, LANE_OFFSETS, LANE_OPTIONS, LANES, Lanes
+from sgwarp.kernels.transmittance import HALF_ROW, LANE_OFFSETS, LANE_OPTIONS, LANES, LaneIds, Lanes
 
 wp.set_module_options(LANE_OPTIONS)
 
@@ -34,7 +34,6 @@ MOST_COLUMNS = 12
 ROW = wp.constant(MOST_COLUMNS)
 SUMS = MOST_COLUMNS + MOST_COLUMNS // 2  # vectors of scratch per fragment: two levels of the tree that sums the lanes
 MOMENTS = 6  # columns of a row: the moments of g, then colours, depth, |d mean| where they are asked for
-GRADIENT = wp.constant(3)  # first plane of the scratch that holds the image's gradient
 BATCH = wp.constant(16)  # fragments whose values under the gradient are computed at a time
 
 
@@ -64,7 +63,7 @@ def make_fold(half: int) -> wp.Function:
 
 @wp.func
 def feature_value(
-    features: wp.array3d[Lanes], gaussian: int, state: wp.array3d[Lanes], slot: int, row: int, slices: int
+    features: wp.array3d[Lanes], gaussian: int, gradient: wp.array3d[Lanes], y: int, column: int, slices: int
 ) -> Lanes:
     """sum_i x_i v_i at the 16 pixels of a row, over all slices of channels."""
     even = Lanes(0.0)  # two sums in turn: one alone would wait for its own last addition
@@ -72,22 +71,9 @@ def feature_value(
     for s in range(slices):
         x = features[gaussian, s, 0]
         for c in range(0, LANES, 2):
-            even += x[c] * state[slot, row, GRADIENT + LANES * s + c]
-            odd += x[c + 1] * state[slot, row, GRADIENT + LANES * s + c + 1]
+            even += x[c] * gradient[y, column, LANES * s + c]
+            odd += x[c + 1] * gradient[y, column, LANES * s + c + 1]
     return even + odd
-
-
-@wp.func
-def read_lanes(image: wp.array2d[float], y: int, first: int, stride: int, inside: int, outside: float) -> Lanes:
-    """Numbers of 16 neighbouring pixels, `stride` apart; those beyond the image's edge are `outside`."""
-    values = Lanes(outside)
-    if inside == LANES:
-        for i in range(LANES):
-            values[i] = image[y, first + i * stride]
-    else:
-        for i in range(inside):
-            values[i] = image[y, first + i * stride]
-    return values
 
 
 @cache
@@ -114,15 +100,14 @@ def make_composite_backward(wide: bool, depth: bool, absolute: bool) -> wp.Kerne
         listed: wp.array[int],  # [I]
         splats: wp.array[Splat],  # [V]
         features: wp.array3d[Lanes],  # [N, S, 1] channels in slices of 16 (wide)
-        transmittance: wp.array2d[float],  # [H, W]
-        v_transmittance: wp.array2d[float],  # [H, W] its gradient
-        v_image: wp.array2d[float],  # [H, W C] gradient of the image
-        v_depth: wp.array2d[float],  # [H, W] gradient of the depth sum (depth)
-        last: wp.array2d[float],  # [H, W] last contributor, counted from its tile's first, -1 = none
+        transmittance: wp.array2d[Lanes],  # [H, tile columns]
+        v_transmittance: wp.array2d[Lanes],  # [H, tile columns] its gradient
+        last: wp.array2d[LaneIds],  # [H, tile columns] last contributor, counted from its tile's first, -1 = none
+        gradient: wp.array3d[Lanes],  # [H, tile columns, padded C (+ 1)] gradient of the image (and depth sum)
         knobs: Knobs,
         width: int,
         height: int,
-        state: wp.array3d[Lanes],  # [slots, 16, 3 + padded C (+ 1)] scratch: transmittance, value behind, last, gradient
+        state: wp.array3d[Lanes],  # [slots, 16, 2] scratch: transmittance, value behind
         reach: wp.array2d[int],  # [slots, 16] scratch: last contributor of each row
         sums: wp.array3d[Lanes],  # [slots, BATCH, SUMS] scratch: rows of a batch before the lanes are summed
         # Out:
@@ -131,25 +116,16 @@ def make_composite_backward(wide: bool, depth: bool, absolute: bool) -> wp.Kerne
         """Paper eq. 1, differentiated, for one tile per thread."""
         tile = base + wp.tid()
         columns = (width + TILE - 1) / TILE
-        x0 = (tile % columns) * TILE
+        column = tile % columns
+        x0 = column * TILE
         y0 = (tile / columns) * TILE
-        inside = wp.min(LANES, width - x0)
-        channels = v_image.shape[1] / width
         tile_reach = int(-1)
         for row in range(TILE):
             row_reach = int(-1)
-            y = y0 + row
-            if y < height:
-                state[slot, row, 0] = read_lanes(transmittance, y, x0, 1, inside, 1.0)
-                state[slot, row, 1] = read_lanes(v_transmittance, y, x0, 1, inside, 0.0)
-                state[slot, row, 2] = read_lanes(last, y, x0, 1, inside, -1.0)
-                for c in range(channels):
-                    state[slot, row, GRADIENT + c] = read_lanes(v_image, y, x0 * channels + c, channels, inside, 0.0)
-                for c in range(channels, state.shape[2] - GRADIENT):
-                    state[slot, row, GRADIENT + c] = Lanes(0.0)
-                if wp.static(depth):
-                    state[slot, row, state.shape[2] - 1] = read_lanes(v_depth, y, x0, 1, inside, 0.0)
-                row_reach = int(wp.max(state[slot, row, 2]))
+            if y0 + row < height:
+                state[slot, row, 0] = transmittance[y0 + row, column]
+                state[slot, row, 1] = v_transmittance[y0 + row, column]
+                row_reach = wp.max(last[y0 + row, column])
             reach[slot, row] = row_reach
             tile_reach = wp.max(tile_reach, row_reach)
         first = offsets[tile]
@@ -178,25 +154,26 @@ def make_composite_backward(wide: bool, depth: bool, absolute: bool) -> wp.Kerne
                     if order > reach[slot, row]:
                         continue
                     alphas = lane_alphas(f, row, knobs)
-                    last_order = state[slot, row, 2]
+                    y = y0 + row
+                    last_order = last[y, column]
                     T = state[slot, row, 0]
                     behind = state[slot, row, 1]
                     for i in range(LANES):
-                        alphas[i] = wp.where(float(order) <= last_order[i], alphas[i], 0.0)
+                        alphas[i] = wp.where(order <= last_order[i], alphas[i], 0.0)
                         T[i] = T[i] / wp.max(1.0 - alphas[i], MIN_PASSED)
                     w = wp.cw_mul(alphas, T)
                     value = Lanes(0.0)
                     if wp.static(wide):
-                        value = feature_value(features, f.gaussian, state, slot, row, features.shape[1])
+                        value = feature_value(features, f.gaussian, gradient, y, column, features.shape[1])
                     else:
-                        value = f.color[0] * state[slot, row, GRADIENT]
-                        value += f.color[1] * state[slot, row, GRADIENT + 1]
-                        value += f.color[2] * state[slot, row, GRADIENT + 2]
-                        red += wp.cw_mul(w, state[slot, row, GRADIENT])
-                        green += wp.cw_mul(w, state[slot, row, GRADIENT + 1])
-                        blue += wp.cw_mul(w, state[slot, row, GRADIENT + 2])
+                        value = f.color[0] * gradient[y, column, 0]
+                        value += f.color[1] * gradient[y, column, 1]
+                        value += f.color[2] * gradient[y, column, 2]
+                        red += wp.cw_mul(w, gradient[y, column, 0])
+                        green += wp.cw_mul(w, gradient[y, column, 1])
+                        blue += wp.cw_mul(w, gradient[y, column, 2])
                     if wp.static(depth):
-                        v_sum = state[slot, row, state.shape[2] - 1]
+                        v_sum = gradient[y, column, gradient.shape[2] - 1]
                         value += f.depth * v_sum
                         z += wp.cw_mul(w, v_sum)
                     excess = value - behind

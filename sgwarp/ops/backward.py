@@ -2,16 +2,18 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 
 import torch
 import warp as wp
 from torch import Tensor
+from torch.nn.functional import pad
 
 from sgwarp.kernels import compositing_block_backward, compositing_lanes_backward, harmonics_backward
 from sgwarp.kernels import projection_backward as kernels
-from sgwarp.kernels.compositing_lanes_backward import GRADIENT, MOMENTS, SUMS, row_columns
-from sgwarp.kernels.transmittance import Lanes
+from sgwarp.kernels.compositing_lanes_backward import MOMENTS, SUMS, row_columns
+from sgwarp.kernels.transmittance import LaneIds, Lanes
 from sgwarp.ops import tiles
 from sgwarp.ops.launch import get_threads, launch, launch_blocks, scratch, view
 from sgwarp.ops.lift import LiftSums, add_weighted
@@ -111,22 +113,26 @@ def composite_backward(
     slices = in_slices(features if wide and features is not None else zeros[:1, :1])
     head = lists.arrays()
     size = [tiles.knobs(settings), camera.width, camera.height]
-    maps = [view(t.contiguous(), wp.float32) for t in (transmittance, v_transmittance)]
-    v_maps = [view(t.contiguous(), wp.float32) for t in (v_image if block else v_image.flatten(1), v_depth)]
     if block:
-        inputs = [*head, view(slices, Lanes), *maps, *v_maps, view(last, wp.int32), *size]
+        maps = [view(t.contiguous(), wp.float32) for t in (transmittance, v_transmittance, v_image, v_depth)]
+        inputs = [*head, view(slices, Lanes), *maps, view(last, wp.int32), *size]
         kernel = compositing_block_backward.make_composite_backward_block(wide, depth, absolute, ordered)
         outputs = [view(rows if ordered else sums, wp.float32)]
         launch_blocks(kernel, [lists.tile_count], inputs, outputs, device=device)
     else:
-        padded = slices.shape[1] * LANE if wide else 3
+        shape = (camera.height, -(-camera.width // LANE), (slices.shape[1] * LANE if wide else 3) + depth, LANE)
+        gradient = scratch("backward gradient", math.prod(shape), torch.float32, device).view(shape)
+        _channels_in_lanes(v_image, gradient[:, :, : shape[2] - depth])
+        if depth:
+            _channels_in_lanes(v_depth[..., None], gradient[:, :, shape[2] - 1 :])
+        maps = [view(_in_lanes(transmittance, 1.0), Lanes), view(_in_lanes(v_transmittance, 0.0), Lanes)]
+        maps += [view(_in_lanes(last, -1), LaneIds), view(gradient, Lanes)]
         scratches = [
-            lane_scratch("backward state", TILE_ROWS, GRADIENT + padded + depth, device),
+            lane_scratch("backward state", TILE_ROWS, 2, device),
             view(scratch("reach", get_threads() * TILE_ROWS, torch.int32, device).view(-1, TILE_ROWS), wp.int32),
             lane_scratch("backward sums", LANE, SUMS, device),
         ]
-        lasts = view(last.to(torch.float32), wp.float32)
-        inputs = [*head, view(slices.unsqueeze(2), Lanes), *maps, *v_maps, lasts, *size]
+        inputs = [*head, view(slices.unsqueeze(2), Lanes), *maps, *size]
         kernel = compositing_lanes_backward.make_composite_backward(wide, depth, absolute)
         launch(kernel, lists.tile_count, [*inputs, *scratches], [view(rows, Lanes)], device=device, slots=True)
     if ordered:
@@ -143,6 +149,20 @@ def composite_backward(
     # The kernel leaves out the factor of d(2^x) = ln 2 2^x dx, and that of the square.
     magnitudes = 2.0 * kernels.LN_2 * sums[:, at_absolute : at_absolute + 2] if absolute else None
     return SplatGradients(sums, at_depth if depth else -1, v_features, magnitudes)
+
+
+def _in_lanes(image: Tensor, outside: float) -> Tensor:
+    """An image [H, W] with 16 pixels of a row in a vector, [H, tile columns, 16]; beyond its edge it is `outside`."""
+    return pad(image, (0, -image.shape[1] % LANE), value=outside).contiguous().unflatten(1, (-1, LANE))
+
+
+def _channels_in_lanes(image: Tensor, out: Tensor) -> None:
+    """Write an image [H, W, C] to `out` [H, tile columns, C or more, 16]; the rest becomes zero."""
+    _, columns, channels, _ = out.shape
+    height, width, given = image.shape
+    if (given, width) != (channels, columns * LANE):
+        image = pad(image, (0, channels - given, 0, columns * LANE - width))
+    out.copy_(image.reshape(height, columns, LANE, channels).transpose(2, 3))
 
 
 def _lift_gradient(
@@ -171,14 +191,11 @@ def project_backward(
 ) -> GaussianGradients:
     """Differentiate `tiles.project`; `pose` asks for each Gaussian's share of the pose's gradient."""
     n, device = len(gaussians), gaussians.device
-    result = GaussianGradients(
-        means=torch.zeros(n, 3, device=device),
-        quats=torch.zeros(n, 4, device=device),
-        scales=torch.zeros(n, 3, device=device),
-        opacities=torch.zeros(n, device=device),
-        means2d=torch.zeros(n, 2, device=device),
-        poses=torch.zeros(n if pose else 0, kernels.POSE_COLUMNS, device=device),
+    means, quats, scales, opacities, means2d, poses = (
+        torch.empty(*shape, device=device)
+        for shape in ((n, 3), (n, 4), (n, 3), (n,), (n, 2), (n if pose else 0, kernels.POSE_COLUMNS))
     )
+    result = GaussianGradients(means, quats, scales, opacities, means2d, poses)
     inputs = [
         view(gaussians.means, wp.vec3),
         view(gaussians.quats, wp.vec4),
@@ -218,8 +235,8 @@ def shade_backward(
     """
     n, device = len(gaussians), gaussians.device
     degree = gaussians.sh_degree if settings.sh_degree is None else min(settings.sh_degree, gaussians.sh_degree)
-    v_sh = torch.zeros_like(gaussians.sh)
-    v_offsets = torch.zeros(n if pose else 0, 3, device=device)
+    v_sh = torch.empty_like(gaussians.sh)
+    v_offsets = torch.empty(n if pose else 0, 3, device=device)
     inputs = [
         view(gaussians.means, wp.vec3),
         view(gaussians.sh, wp.vec3),

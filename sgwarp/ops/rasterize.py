@@ -30,14 +30,19 @@ class Rendering:
         expected_depth: Mean z weighted by alpha T [m], 0 where nothing is, float32 [H, W]; None if not asked for.
         depth: z of the Gaussian at which accumulated opacity passes `surface_opacity` [m], 0 = no hit, float32 [H, W];
             None if not asked for.
-        culled: Gaussians left out, by reason.
+        status_counts: How many Gaussians had each status of kernels/projection.py, int64.
     """
 
     features: Tensor
     alpha: Tensor
     expected_depth: Tensor | None
     depth: Tensor | None
-    culled: dict[str, int]
+    status_counts: Tensor
+
+    @property
+    def culled(self) -> dict[str, int]:
+        """Gaussians left out, by reason; reading it waits for the device."""
+        return tiles.culled(self.status_counts)
 
 
 def rasterize(
@@ -84,7 +89,7 @@ def rasterize(
     mean_depth = None
     if expected_depth:
         mean_depth = torch.where(alpha > 0, depth_sum / alpha.clamp(min=1e-12), 0.0)
-    return Rendering(image, alpha, mean_depth, surface if depth else None, projected.culled())
+    return Rendering(image, alpha, mean_depth, surface if depth else None, projected.counts())
 
 
 def packed_colors(

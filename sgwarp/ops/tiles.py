@@ -29,10 +29,18 @@ class Projected:
     status: Tensor  # uint8 [N], see kernels/projection.py
     depths: Tensor  # float32 [N] z [m], valid where visible
 
-    def culled(self) -> dict[str, int]:
-        """How many Gaussians were left out, by reason."""
-        counts = torch.bincount(self.status.to(torch.int64), minlength=len(projection.STATUS_NAMES)).tolist()
-        return {name: counts[i] for i, name in enumerate(projection.STATUS_NAMES) if i != 0 and counts[i]}
+    def counts(self) -> Tensor:
+        """How many Gaussians have each status, int64; on CUDA nobody waits for it until it is read."""
+        if self.status.device.type == "cuda":
+            names = torch.arange(len(projection.STATUS_NAMES), device=self.status.device)
+            return (self.status[:, None] == names).sum(dim=0)
+        return torch.bincount(self.status, minlength=len(projection.STATUS_NAMES))
+
+
+def culled(counts: Tensor) -> dict[str, int]:
+    """How many Gaussians were left out, by reason, from `Projected.counts`."""
+    named = dict(zip(projection.STATUS_NAMES, counts.tolist(), strict=True))
+    return {name: count for name, count in named.items() if count and name != "visible"}
 
 
 @dataclass(frozen=True)
@@ -140,7 +148,8 @@ def project(gaussians: Gaussians, camera: Camera, settings: RasterSettings) -> P
     ]
     outputs = [splats, view(status, wp.uint8), view(depths, wp.float32)]
     launch(projection.project_gaussians, n, inputs, outputs, device=device)
-    if gaussians.colors_may_be_non_finite:  # the kernel reads geometry and opacity only
+    # The kernel reads geometry and opacity only. On CUDA it is cheaper to look at all than to wait for the answer.
+    if device.type == "cuda" or gaussians.colors_may_be_non_finite:
         status.masked_fill_(~gaussians.finite, int(projection.NON_FINITE))
     return Projected(splats, status, depths)
 

@@ -129,7 +129,7 @@ def _render(
     lists = tiles.bin_splats(projected, order, tiles.shade(gaussians, camera, order, settings), camera)
     image, transmittance, depth_sum, surface = composite(lists, camera, settings, None, True, schedule)
     alpha = 1.0 - transmittance
-    return image, alpha, depth_sum / alpha.clamp(min=1e-12), surface, projected.culled()
+    return image, alpha, depth_sum / alpha.clamp(min=1e-12), surface, tiles.culled(projected.counts())
 
 
 def _reference(fields: dict[str, Tensor], camera: Camera) -> reference.Raster:
