@@ -40,7 +40,7 @@ plt.rcParams.update({"figure.dpi": 110, "figure.constrained_layout.use": True, "
 
 def show(ax, image, title, **options):
     """An image without axes."""
-    image = image.detach()
+    image = image.detach().numpy()
     ax.imshow(image if image.ndim == 2 else image.clip(0, 1), **options)
     ax.set_title(title)
     ax.axis("off")
@@ -260,15 +260,15 @@ plt.show()
 
 # %%
 half_size = torch.tensor([WIDTH / 2, HEIGHT / 2])
-pull = {"gsplat's call": (centres["gsplat's call"] * half_size).norm(dim=1)}
-pull["Inria's call"] = centres["Inria's call"].norm(dim=1)
-seen = pull["Inria's call"] > 0
-proxy_difference = float((pull["Inria's call"] - pull["gsplat's call"]).norm() / pull["Inria's call"].norm())
+gsplats = (centres["gsplat's call"] * half_size).norm(dim=1)
+inrias = centres["Inria's call"].norm(dim=1)
+seen = inrias > 0
+proxy_difference = float((inrias - gsplats).norm() / inrias.norm())
 
 fig, ax = plt.subplots(figsize=(4.2, 3.6))
-ax.scatter(pull["gsplat's call"][seen], pull["Inria's call"][seen], s=5, color="#2f9e6e", linewidths=0)
-ends = [float(pull["Inria's call"][seen].min()), float(pull["Inria's call"].max())]
+ends = [float(inrias[seen].min()), float(inrias.max())]
 ax.plot(ends, ends, color="0.4", linewidth=0.7)
+ax.scatter(gsplats[seen].numpy(), inrias[seen].numpy(), s=5, color="#2f9e6e", linewidths=0)
 ax.set(xscale="log", yscale="log", xlabel="gsplat: |means2d.grad (W/2, H/2)|", ylabel="Inria: |means2D.grad|")
 ax.set_title(f"gradient of {int(seen.sum())} projected centres")
 plt.show()
@@ -328,11 +328,11 @@ print(f"the same call again, the same bits: {same_bits}")
 # %%
 fig, (left, right) = plt.subplots(1, 2, figsize=(10, 3))
 for (name, curve), width, colour in zip(losses.items(), (4, 1.2), ("#9ad1b5", "#222222"), strict=True):
-    left.plot(curve, label=name, linewidth=width, color=colour)
+    left.plot(curve.numpy(), label=name, linewidth=width, color=colour)
 left.set(xlabel="step", ylabel="L1 loss", title="two calls, one curve")
 left.legend()
 apart = (losses["gsplat's call"] - losses["Inria's call"]).abs() / losses["Inria's call"]
-right.semilogy(apart.clip(min=1e-9), color="#d95f02", linewidth=0.9)
+right.semilogy(apart.clip(min=1e-9).numpy(), color="#d95f02", linewidth=0.9)
 right.set(xlabel="step", title="relative difference of the losses")
 plt.show()
 
