@@ -132,10 +132,10 @@ def _render(
     settings = RasterSettings()
     projected = tiles.project(gaussians, camera, settings)
     order = tiles.depth_order(projected)
-    lists = tiles.bin_splats(projected, order, tiles.shade(gaussians, camera, order, settings), camera, settings)
+    lists = tiles.bin_splats(projected, order, tiles.shade(gaussians, camera, order, settings), camera)
     image, transmittance, depth_sum, surface = composite(lists, camera, settings, None, True, schedule)
     alpha = 1.0 - transmittance
-    return image, alpha, depth_sum / alpha.clamp(min=1e-12), surface, projected.culled()
+    return image, alpha, depth_sum / alpha.clamp(min=1e-12), surface, tiles.culled(projected.counts())
 
 
 def _reference(fields: dict[str, Tensor], pose: Tensor, camera: Camera) -> reference.Raster:
