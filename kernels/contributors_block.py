@@ -6,8 +6,9 @@ is held in a register.
 
 import warp as wp
 
-from sgwarp.kernels.binning import TILE, Fragment
+from sgwarp.kernels.binning import TILE
 from sgwarp.kernels.compositing_block import STAGE, alpha_at
+from sgwarp.kernels.gaussian import Splat
 from sgwarp.kernels.projection import Knobs
 from sgwarp.kernels.transmittance import BLOCK_OPTIONS, attenuated, contribution
 
@@ -40,8 +41,9 @@ def enter_list(
 @wp.kernel
 def rank_contributors_block(
     # In:
-    offsets: wp.array[int],  # [tiles + 1] first fragment of each tile
-    fragments: wp.array[Fragment],  # [I]
+    offsets: wp.array[int],  # [tiles + 1] first place of each tile
+    listed: wp.array[int],  # [I] ranks, tile by tile, front to back
+    splats: wp.array[Splat],  # [V] in depth order
     knobs: Knobs,
     width: int,  # [pixels]
     height: int,
@@ -52,10 +54,8 @@ def rank_contributors_block(
     """The K largest alpha T of paper eq. 1 at each pixel; one block per tile."""
     tile, t = wp.tid()
     columns = (width + TILE - 1) / TILE
-    column = t % TILE
-    row = t / TILE
-    x = (tile % columns) * TILE + column
-    y = (tile / columns) * TILE + row
+    x = (tile % columns) * TILE + t % TILE
+    y = (tile / columns) * TILE + t / TILE
     inside = x < width and y < height
     places = ids_out.shape[2]
     if inside:
@@ -63,19 +63,20 @@ def rank_contributors_block(
             ids_out[y, x, place] = -1
             weights_out[y, x, place] = 0.0
     T = wp.where(inside, 1.0, 0.0)
-    listed = int(0)
+    used = int(0)
     least = float(0.0)  # weight of the last place
     first = offsets[tile]
     stop = offsets[tile + 1]
     for start in range(first, stop, STAGE):
-        staged = wp.tile_load(fragments, shape=STAGE, offset=start, storage="shared")
+        ranks = wp.tile_load(listed, shape=STAGE, offset=start, storage="shared")
+        staged = wp.tile_load_indexed(splats, indices=ranks, shape=(STAGE,), storage="shared")
         for j in range(wp.min(STAGE, stop - start)):
             f = staged[j]
-            alpha = alpha_at(f, column, row, knobs)
+            alpha = alpha_at(f, x, y, knobs)
             w = contribution(alpha, T, knobs)
             if w > least:
-                enter_list(w, f.gaussian, wp.min(listed, places - 1), y, x, ids_out, weights_out)
-                listed = wp.min(listed + 1, places)
+                enter_list(w, f.gaussian, wp.min(used, places - 1), y, x, ids_out, weights_out)
+                used = wp.min(used + 1, places)
                 least = weights_out[y, x, places - 1]
             T = attenuated(alpha, T, knobs)
         # No later weight exceeds T: a pixel is decided once its least is that large.

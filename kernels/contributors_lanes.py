@@ -6,7 +6,7 @@ so on. A fragment enters all 16 lists at once, from the last place up, without a
 
 import warp as wp
 
-from sgwarp.kernels.binning import TILE, Fragment
+from sgwarp.kernels.binning import AHEAD, TILE, fragment_of, prefetch
 from sgwarp.kernels.compositing_lanes import (
     CLOSE_EVERY,
     lane_alphas,
@@ -14,8 +14,8 @@ from sgwarp.kernels.compositing_lanes import (
     lane_contributions,
     open_lanes,
     open_row_mask,
-    row_is_reached,
 )
+from sgwarp.kernels.gaussian import Splat
 from sgwarp.kernels.projection import Knobs
 from sgwarp.kernels.transmittance import LANE_OPTIONS, LANES, LaneIds, Lanes
 
@@ -76,15 +76,16 @@ def rank_contributors(
     # In:
     base: int,
     slot: int,
-    offsets: wp.array[int],  # [tiles + 1] first fragment of each tile
-    fragments: wp.array[Fragment],  # [I]
+    offsets: wp.array[int],  # [tiles + 1] first place of each tile
+    listed: wp.array[int],  # [I] ranks, tile by tile, front to back
+    splats: wp.array[Splat],  # [V] in depth order
     knobs: Knobs,
     width: int,  # [pixels]
     height: int,
     state: wp.array3d[Lanes],  # [slots, 16, 1] scratch
     weights: wp.array3d[Lanes],  # [slots, 16, K] scratch
     owners: wp.array3d[LaneIds],  # [slots, 16, K] scratch
-    listed: wp.array2d[int],  # [slots, 16] scratch: places in use of the longest list of each row
+    used: wp.array2d[int],  # [slots, 16] scratch: places in use of the longest list of each row
     # Out:
     ids_out: wp.array3d[int],  # [H, W, K] Gaussians by descending alpha T, then by depth; -1 = none
     weights_out: wp.array3d[float],  # [H, W, K] their alpha T; 0 = none
@@ -97,23 +98,25 @@ def rank_contributors(
     places = ids_out.shape[2]
     for row in range(TILE):
         state[slot, row, 0] = open_lanes(x0, width)
-        listed[slot, row] = 0
+        used[slot, row] = 0
         for place in range(places):
             weights[slot, row, place] = Lanes(0.0)
             owners[slot, row, place] = LaneIds(-1)
     open_rows = open_row_mask(y0, height)
     first = offsets[tile]
-    for k in range(first, offsets[tile + 1]):
-        f = fragments[k]
+    stop = offsets[tile + 1]
+    for k in range(first, stop):
+        prefetch(splats, listed[wp.min(k + AHEAD, stop - 1)])
+        f = fragment_of(splats, listed[k], x0, y0)
         for row in range(f.first_row, f.last_row + 1):
-            if row_is_reached(f, row, knobs) and (open_rows >> row) & 1 != 0:
+            if (open_rows >> row) & 1 != 0:
                 T = state[slot, row, 0]
                 alphas = lane_alphas(f, row, knobs)
                 w = lane_contributions(alphas, T, knobs)
                 state[slot, row, 0] = lane_attenuated(alphas, T, knobs)
-                last = wp.min(listed[slot, row], places - 1)
+                last = wp.min(used[slot, row], places - 1)
                 if enter_lists(w, f.gaussian, last, slot, row, weights, owners):
-                    listed[slot, row] = last + 1
+                    used[slot, row] = last + 1
         if (k - first) % CLOSE_EVERY == CLOSE_EVERY - 1:
             open_rows = still_ranked(open_rows, slot, places, state, weights)
             if open_rows == 0:

@@ -45,7 +45,7 @@ def top_contributors(
         raise InputError(f"k: expected a positive integer, got {k!r}")
     projected = tiles.project(gaussians, camera, settings)
     order = tiles.depth_order(projected)
-    lists = tiles.bin_splats(projected, order, None, camera, settings)
+    lists = tiles.bin_splats(projected, order, None, camera)
     return rank(lists, camera, settings, k)
 
 
@@ -59,7 +59,7 @@ def rank(
     device = lists.order.device
     ids = torch.empty(*camera.size, k, dtype=torch.int32, device=device)
     weights = torch.empty(*camera.size, k, device=device)
-    inputs = [view(lists.offsets, wp.int32), lists.fragments, tiles.knobs(settings), camera.width, camera.height]
+    inputs = [*lists.arrays(), tiles.knobs(settings), camera.width, camera.height]
     outputs = [view(ids, wp.int32), view(weights, wp.float32)]
     if runs_in_blocks(device, schedule):
         kernel = contributors_block.rank_contributors_block
@@ -67,12 +67,12 @@ def rank(
         return ids, weights
     threads = get_threads()
     owners = scratch("contributors", threads * TILE_ROWS * k * LANE, torch.int32, device)
-    listed = scratch("contributors listed", threads * TILE_ROWS, torch.int32, device)
+    used = scratch("contributors used", threads * TILE_ROWS, torch.int32, device)
     inputs += [
         lane_scratch("state", TILE_ROWS, 1, device),
         lane_scratch("weights", TILE_ROWS, k, device),
         view(owners.view(threads, TILE_ROWS, k, LANE), LaneIds),
-        view(listed.view(threads, TILE_ROWS), wp.int32),
+        view(used.view(threads, TILE_ROWS), wp.int32),
     ]
     launch(contributors_lanes.rank_contributors, lists.tile_count, inputs, outputs, device=device, slots=True)
     return ids, weights

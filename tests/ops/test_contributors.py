@@ -25,7 +25,7 @@ def top(
     gaussians: Gaussians, camera: Camera, k: int, schedule: str, settings: RasterSettings = SETTINGS
 ) -> tuple[torch.Tensor, torch.Tensor]:
     projected = tiles.project(gaussians, camera, settings)
-    lists = tiles.bin_splats(projected, tiles.depth_order(projected), None, camera, settings)
+    lists = tiles.bin_splats(projected, tiles.depth_order(projected), None, camera)
     return rank(lists, camera, settings, k, schedule)
 
 
