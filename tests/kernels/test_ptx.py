@@ -43,6 +43,7 @@ def cuda_kernels() -> list[wp.Kernel]:
 def test_the_list_of_kernels_is_complete():
     names = {kernel.key.split("__locals__")[-1] for kernel in cuda_kernels()}
     assert {"project_gaussians", "evaluate_harmonics", "list_sorted", "sum_rows", "find_center_pixels"} <= names
+    assert "rank_contributors_block" in names
     factories = {
         "list_contributors",
         "composite_colors_block",
