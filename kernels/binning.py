@@ -98,16 +98,16 @@ def row_range(splats: wp.array[Splat], rank: int, x: float):
     The lower border dy(dx) = (-a b dx + a c sqrt(w^2 - dx^2)) / (b^2 + c^2), w the half width, is concave: see
     `column_range`.
     """
-    a = splats[rank].a
     b = splats[rank].b
     c = splats[rank].c
+    inv_bc = splats[rank].inv_bc
     half_width = splats[rank].half_width
     lo = wp.max(-x, -half_width)
     hi = wp.min(float(TILE - 1) - x, half_width)
-    summit = -b * splats[rank].half_height / a
+    summit = -half_width * b * inv_bc
     at_bottom = wp.clamp(summit, lo, hi)
     at_top = wp.clamp(-summit, lo, hi)
-    unit = a / (b * b + c * c)
+    unit = splats[rank].a * inv_bc * inv_bc
     w2 = half_width * half_width
     bottom = (c * wp.sqrt(wp.max(w2 - at_bottom * at_bottom, 0.0)) - b * at_bottom) * unit
     top = (-c * wp.sqrt(wp.max(w2 - at_top * at_top, 0.0)) - b * at_top) * unit

@@ -10,6 +10,7 @@ from functools import cache
 import warp as wp
 
 from sgwarp.kernels.binning import AHEAD, TILE, Fragment, fragment_of, prefetch
+from sgwarp.kernels.compositing_rows import row_walk
 from sgwarp.kernels.gaussian import Splat
 from sgwarp.kernels.projection import Knobs
 from sgwarp.kernels.transmittance import (
@@ -25,6 +26,7 @@ from sgwarp.kernels.transmittance import (
 
 wp.set_module_options(LANE_OPTIONS)
 
+BATCH = wp.constant(32)  # fragments that are walked row by row
 CLOSE_EVERY = wp.constant(32)  # fragments between two looks at which rows are closed
 
 
@@ -96,12 +98,16 @@ def still_open(mask: int, state: wp.array3d[Lanes], slot: int) -> int:
 
 @cache
 def color_walk(depth: bool, record: bool) -> wp.Function:
-    """Device function that composites a tile's three packed channels into its scratch.
+    """Device function that composites three channels of a tile into its scratch.
+
+    Fragments come in batches: first each is entered in the list of every row it reaches, then row by row the lists are
+    walked with the state of the row in registers.
 
     Planes of the scratch: transmittance, three channels, with `depth` sum of alpha T z and the surface depth, with
-    `record` the last contributing fragment. With both, the surface is kept as a fragment, not as a depth.
+    `record` the last contributor. With both, the surface is kept as a place in the tile's list, not as a depth.
     """
     planes = color_planes(depth, record)
+    composite_row = row_walk(depth, record)
 
     @wp.func
     def walk(
@@ -114,6 +120,8 @@ def color_walk(depth: bool, record: bool) -> wp.Function:
         width: int,
         height: int,
         state: wp.array3d[Lanes],
+        batch: wp.array2d[Fragment],
+        reached: wp.array3d[int],
     ):
         columns = (width + TILE - 1) / TILE
         x0 = (tile % columns) * TILE
@@ -129,37 +137,22 @@ def color_walk(depth: bool, record: bool) -> wp.Function:
         open_rows = open_row_mask(y0, height)
         first = offsets[tile]
         stop = offsets[tile + 1]
-        for k in range(first, stop):
-            prefetch(splats, listed[wp.min(k + AHEAD, stop - 1)])
-            f = fragment_of(splats, listed[k], x0, y0)
-            for row in range(f.first_row, f.last_row + 1):
+        for start in range(first, stop, BATCH):
+            size = wp.min(BATCH, stop - start)
+            for b in range(size):
+                prefetch(splats, listed[wp.min(start + b + AHEAD, stop - 1)])
+                f = fragment_of(splats, listed[start + b], x0, y0)
+                batch[slot, b] = f
+                reached[slot, 0, b] = f.first_row
+                reached[slot, 1, b] = f.last_row
+            for b in range(size, BATCH):
+                reached[slot, 1, b] = -1
+            for row in range(TILE):
                 if (open_rows >> row) & 1 != 0:
-                    T = state[slot, row, 0]
-                    alphas = lane_alphas(f, row, knobs)
-                    w = lane_contributions(alphas, T, knobs)
-                    state[slot, row, 0] = lane_attenuated(alphas, T, knobs)
-                    state[slot, row, 1] = state[slot, row, 1] + w * f.color[0]
-                    state[slot, row, 2] = state[slot, row, 2] + w * f.color[1]
-                    state[slot, row, 3] = state[slot, row, 3] + w * f.color[2]
-                    if wp.static(record):
-                        state[slot, row, wp.static(planes - 1)] = latest(
-                            w, float(k - first), state[slot, row, wp.static(planes - 1)]
-                        )
-                    if wp.static(depth):
-                        state[slot, row, 4] = state[slot, row, 4] + w * f.depth
-                        surface = state[slot, row, 5]
-                        found = f.depth
-                        if wp.static(record):
-                            found = float(k - first)
-                        for i in range(LANES):
-                            behind = T[i] - w[i]
-                            here = wp.where(behind <= knobs.surface_transmittance, found, surface[i])
-                            surface[i] = wp.where(T[i] > knobs.surface_transmittance, here, surface[i])
-                        state[slot, row, 5] = surface
-            if (k - first) % CLOSE_EVERY == CLOSE_EVERY - 1:
-                open_rows = still_open(open_rows, state, slot)
-                if open_rows == 0:
-                    break
+                    composite_row(slot, row, start - first, batch, reached, knobs, state)
+            open_rows = still_open(open_rows, state, slot)
+            if open_rows == 0:
+                break
 
     return walk
 
@@ -241,6 +234,8 @@ def make_composite_colors(depth: bool, record: bool) -> wp.Kernel:
         width: int,  # [pixels]
         height: int,
         state: wp.array3d[Lanes],  # [slots, 16, planes] scratch
+        batch: wp.array2d[Fragment],  # [slots, BATCH] scratch
+        reached: wp.array3d[int],  # [slots, 2, BATCH] scratch: first and last row of each
         # Out:
         colors_out: wp.array2d[wp.vec3],  # [H, W] sum of alpha T color
         transmittance_out: wp.array2d[float],  # [H, W]
@@ -254,7 +249,7 @@ def make_composite_colors(depth: bool, record: bool) -> wp.Kernel:
         columns = (width + TILE - 1) / TILE
         x0 = (tile % columns) * TILE
         y0 = (tile / columns) * TILE
-        walk(tile, slot, offsets, listed, splats, knobs, width, height, state)
+        walk(tile, slot, offsets, listed, splats, knobs, width, height, state, batch, reached)
         write_colors(slot, x0, y0, width, height, state, colors_out, transmittance_out)
         if wp.static(record):
             write_last(slot, x0, y0, width, height, state, last_plane, last_out)
@@ -278,7 +273,6 @@ def make_composite_colors(depth: bool, record: bool) -> wp.Kernel:
     return composite_colors
 
 
-BATCH = wp.constant(32)  # fragments whose weights are kept before they are multiplied by their features
 PASS = 16  # channels accumulated in registers at a time
 Accumulator = wp.types.matrix(shape=(PASS, LANES), dtype=wp.float32)
 

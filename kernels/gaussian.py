@@ -56,9 +56,9 @@ class Splat:
     half_height: float
     reach: float  # the footprint is u^2 + v^2 <= reach
     summit: float  # dy at which its right border is furthest right [pixels]
+    inv_bc: float  # 1 / sqrt(b^2 + c^2) [pixels]
     gaussian: int
     color: wp.vec3
-    spare: int
 
 
 @wp.func
@@ -113,12 +113,6 @@ def projected_factor(camera: Pinhole, point: wp.vec3, quat: wp.vec4, scale: wp.v
 def factor_determinant(m_x: wp.vec3, m_y: wp.vec3) -> float:
     """det(M M^T) as the sum of squared minors (Cauchy-Binet): exact zero for needles seen end on, never negative."""
     return wp.length_sq(wp.cross(m_x, m_y))
-
-
-@wp.func
-def footprint_summit(splat: Splat) -> float:
-    """dy at which the right border of the footprint is furthest right [pixels]."""
-    return -splat.b * wp.sqrt(splat.reach / (splat.b * splat.b + splat.c * splat.c)) / splat.c
 
 
 @wp.func

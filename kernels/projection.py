@@ -12,7 +12,6 @@ from sgwarp.kernels.gaussian import (
     camera_from_world,
     ewa_rows,
     factor_determinant,
-    footprint_summit,
     projected_factor,
 )
 
@@ -136,10 +135,11 @@ def project_gaussians(
     splat.level = wp.log2(opacity)
     splat.depth = point[2]
     splat.reach = splat.level - knobs.alpha_min_level + LEVEL_SLACK
-    sigmas = wp.sqrt(splat.reach) / unit
-    splat.half_width = sigmas * wp.sqrt(xx)
-    splat.half_height = sigmas * wp.sqrt(yy)
-    splat.summit = footprint_summit(splat)
+    radius = wp.sqrt(splat.reach)
+    splat.half_width = radius * wp.sqrt(xx) / unit
+    splat.half_height = radius / splat.c
+    splat.inv_bc = 1.0 / wp.sqrt(splat.b * splat.b + splat.c * splat.c)
+    splat.summit = -splat.b * radius * splat.inv_bc / splat.c
     x = splat.mean[0]
     y = splat.mean[1]
     inside = x + splat.half_width >= 0.5 and x - splat.half_width <= float(camera.width) - 0.5

@@ -1,7 +1,5 @@
 """Alpha and transmittance of one Gaussian at one pixel: shared by compositing and lifting, by both schedules."""
 
-import platform
-
 import warp as wp
 
 from sgwarp.kernels.projection import Knobs
@@ -19,8 +17,6 @@ LANE_FLAGS = (
     "-march=native -ffast-math -ffp-contract=fast -mprefer-vector-width=512"
     " -mllvm=-inline-threshold=9000 -Wno-nan-infinity-disabled"
 )
-if platform.machine() in ("x86_64", "AMD64"):
-    LANE_FLAGS += " -mrecip=vec-divf:1"  # divide lanes by an estimate and one Newton step, good to the last digit or so
 LANE_OPTIONS = {"enable_backward": False, "fast_math": True, "cpu_compiler_flags": LANE_FLAGS}
 BLOCK_OPTIONS = {"enable_backward": False, "fast_math": False}
 

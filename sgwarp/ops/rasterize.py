@@ -9,7 +9,7 @@ import warp as wp
 from torch import Tensor
 
 from sgwarp.errors import InputError
-from sgwarp.kernels import compositing_block, compositing_lanes
+from sgwarp.kernels import binning, compositing_block, compositing_lanes
 from sgwarp.kernels.transmittance import Lanes
 from sgwarp.ops import tiles
 from sgwarp.ops.launch import get_threads, launch, launch_blocks, scratch, view
@@ -178,7 +178,7 @@ def _composite(
         else:
             state = lane_scratch("state", TILE_ROWS, compositing_lanes.color_planes(wants_depth, record), device)
             kernel = compositing_lanes.make_composite_colors(wants_depth, record)
-            launch(kernel, lists.tile_count, [*inputs, state], outputs, device=device, slots=True)
+            launch(kernel, lists.tile_count, [*inputs, state, *batch_scratch(device)], outputs, device=device, slots=True)
         if image is None:
             image = colors if features is None else colors[..., : features.shape[1]]
     assert image is not None
@@ -193,6 +193,17 @@ def lane_scratch(name: str, rows: int, planes: int, device: torch.device) -> wp.
     shape = (get_threads(), rows, planes, LANE)
     memory = scratch(f"lanes {name}", get_threads() * rows * planes * LANE, torch.float32, device)
     return view(memory.view(shape), Lanes)
+
+
+def batch_scratch(device: torch.device) -> list[wp.array]:
+    """Scratch of the lane schedule for a batch of fragments and the rows they reach."""
+    threads, batch = get_threads(), int(compositing_lanes.BATCH)
+    size = wp.types.type_size_in_bytes(binning.Fragment)
+    memory = scratch("lanes batch", threads * batch * size // 4, torch.int32, device)
+    layout = {"dtype": binning.Fragment, "shape": (threads, batch), "capacity": 4 * len(memory)}
+    fragments: wp.array = wp.array(ptr=memory.data_ptr(), device=wp.device_from_torch(device), **layout)
+    reached = scratch("lanes reached", threads * 2 * batch, torch.int32, device).view(threads, 2, batch)
+    return [fragments, view(reached, wp.int32)]
 
 
 def in_slices(features: Tensor) -> Tensor:

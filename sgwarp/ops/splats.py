@@ -211,13 +211,13 @@ def _as_splats(
         level = opacities.to(torch.float32).log2()
         reach = level - math.log2(settings.alpha_min) + LEVEL_SLACK
         a, b, c = factors.unbind(1)
-        sigmas, steepness = reach.clamp(min=0.0).sqrt(), (b * b + c * c).sqrt()
-        half_width, half_height = sigmas * steepness / (a * c), sigmas / c
-        summit = -b * sigmas / steepness / c
-        columns = [*means2d.unbind(1), a, b, c, level, depths, half_width, half_height, reach, summit]
+        radius, steepness = reach.clamp(min=0.0).sqrt(), (b * b + c * c).sqrt()
+        half_width, half_height = radius * steepness / (a * c), radius / c
+        footprint = [half_width, half_height, reach, -b * radius / steepness / c, 1.0 / steepness]
+        columns = [*means2d.unbind(1), a, b, c, level, depths, *footprint]
         values = torch.stack([t.to(torch.float32) for t in columns], dim=1)
         seen = torch.isfinite(values.sum(1)) & (reach >= LEVEL_SLACK) & (a > 0) & (c > 0)
-        hidden = values.new_tensor([0.0, 0.0, 1.0, 0.0, 1.0, HIDDEN_LEVEL, 0.0, 0.0, 0.0, HIDDEN_LEVEL, 0.0])
+        hidden = values.new_tensor([0.0, 0.0, 1.0, 0.0, 1.0, HIDDEN_LEVEL, 0.0, 0.0, 0.0, HIDDEN_LEVEL, 0.0, 1.0])
         memory = tiles.splat_memory(len(values), device, "composited splats")
         rows = memory.view(torch.float32).view(-1, tiles.SPLAT_WORDS)
         rows[:, : values.shape[1]] = torch.where(seen[:, None], values, hidden)
