@@ -14,7 +14,7 @@ Along a row only u changes, and from row to row u and v change by b and c. So a 
 vectors, d its distance to the middle one of the rows at work, and the six moments follow once per fragment. Counted
 from the middle, d b stays as small as a tile, and nothing large cancels.
 
-The thread that owns a tile writes one row per intersection, so no two threads write the same memory.
+The thread that owns a tile writes one row for each place of its list, so no two threads write the same memory.
 """
 
 from functools import cache
