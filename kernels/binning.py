@@ -5,11 +5,12 @@ the intersections themselves are never sorted. On the CPU the counting pass runs
 slice counts its own tiles, prefix sums turn the counts into disjoint places, and each slice fills them. Any number of
 threads writes the same lists.
 
-On CUDA one thread per Gaussian emits its (tile, intersection) pairs in depth order; a stable radix sort by tile alone
-then gives the same lists.
+On CUDA one thread per Gaussian emits its (tile, entry) pairs in depth order; a stable radix sort by tile alone then
+gives the same lists.
 
 A list holds ranks, places in the depth order, where the splats lie one to a line of the cache. Copies of the splats,
-tile by tile, could be read front to back, but cost more to write than that saves.
+tile by tile, could be read front to back, but cost more to write than that saves. A place is a position in the lists,
+an entry an intersection (one splat in one tile) counted splat by splat.
 """
 
 import warp as wp
@@ -25,7 +26,7 @@ AHEAD = wp.constant(6)  # splats between the one at work and the one that is fet
 
 @wp.struct
 class Fragment:
-    """A splat seen from one tile."""
+    """A splat seen from one tile; made while a list is walked, and never stored."""
 
     x: float  # mean relative to the centre of the tile's first pixel [pixels]
     y: float
@@ -88,7 +89,7 @@ def row_columns(splat: Splat, row: int, width: int, box_first: int, box_last: in
     if (i < splats.shape[0]) __builtin_prefetch(splats.data + i);
 #endif
 """)
-def prefetch(splats: wp.array[Splat], i: int): ...
+def prefetch(splats: wp.array[Splat], i: int): ...  # a hint for the CPU's cache
 
 
 @wp.func
@@ -116,7 +117,7 @@ def row_range(splats: wp.array[Splat], rank: int, x: float):
 
 @wp.func
 def fragment_of(splats: wp.array[Splat], rank: int, x0: int, y0: int) -> Fragment:
-    """A splat relative to the tile whose first pixel is (x0, y0). Fields are read one by one: a copy would cost more."""
+    """A splat relative to the tile whose first pixel is (x0, y0); fields are read one by one, as a copy costs more."""
     fragment = Fragment()
     fragment.x = splats[rank].mean[0] - float(x0) - 0.5
     fragment.y = splats[rank].mean[1] - float(y0) - 0.5
@@ -151,7 +152,7 @@ def order_splat(
 @wp.kernel
 def order_splats(
     # In:
-    base: int,  # first place of this launch
+    base: int,  # first rank of this launch
     order: wp.array[int],  # [V] Gaussians
     splats: wp.array[Splat],  # [N]
     colors: wp.array[wp.vec3],  # [V] or empty
@@ -203,13 +204,13 @@ def fill_tiles(
     per_slice: int,
     width: int,
     height: int,
-    entries: wp.array[int],  # [V] first intersection of each splat
+    entries: wp.array[int],  # [V] first entry of each splat
     # In and out:
     cursors: wp.array2d[int],  # [slices, tiles] next free place of each (slice, tile)
     # Out:
     listed_out: wp.array[int],  # [I] ranks of the splats, tile by tile, front to back
-    places_out: wp.array[int],  # [I] where each intersection, by splat, stands in the lists; or empty
-    tiles_out: wp.array[int],  # [I] its tile; or empty
+    places_out: wp.array[int],  # [I] place of each entry; or empty
+    tiles_out: wp.array[int],  # [I] tile of each entry; or empty
 ):
     """Write the tile lists. One thread per slice; the cursors keep slices apart."""
     s = base + wp.tid()
@@ -267,11 +268,11 @@ def emit_tiles(
     splats: wp.array[Splat],  # [V] in depth order
     width: int,
     height: int,
-    entries: wp.array[int],  # [V + 1] first intersection of each splat; the culled have none
+    entries: wp.array[int],  # [V + 1] first entry of each splat; the culled have none
     # Out:
-    tiles_out: wp.array[int],  # [I] sort key
-    intersections_out: wp.array[int],  # [I] sort value
-    ranks_out: wp.array[int],  # [I] place in the depth order
+    tiles_out: wp.array[int],  # [I] tile of each entry, the sort key
+    intersections_out: wp.array[int],  # [I] the entry itself, the sort value
+    ranks_out: wp.array[int],  # [I] rank of each entry
 ):
     """List the tiles of each splat, row by row (CUDA)."""
     k = wp.tid()
@@ -294,11 +295,11 @@ def emit_tiles(
 @wp.kernel
 def list_sorted(
     # In:
-    sorted_intersections: wp.array[int],  # [I]
-    ranks: wp.array[int],  # [I] place in the depth order, by intersection
+    sorted_intersections: wp.array[int],  # [I] entries, by place
+    ranks: wp.array[int],  # [I] rank of each entry
     # Out:
     listed_out: wp.array[int],  # [I] ranks of the splats, tile by tile, front to back
-    places_out: wp.array[int],  # [I] where each intersection, by splat, stands in the lists
+    places_out: wp.array[int],  # [I] place of each entry
 ):
     """Read the lists off the sorted intersections (CUDA). One thread per place."""
     place = wp.tid()

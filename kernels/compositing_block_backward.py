@@ -2,8 +2,8 @@
 
 The mathematics is that of `compositing_lanes_backward.py`. For a batch of 16 fragments each thread computes w and g at
 its own pixel, then thread (fragment, column) sums one column of the fragment's row over the 256 pixels. The sum goes to
-the Gaussian by one atomic addition per (tile, fragment, column) or, in the ordered variant, to the row of its
-intersection, which `projection_backward.sum_intersections` adds up in a fixed order.
+the Gaussian by one atomic addition per (tile, fragment, column) or, in the ordered variant, to the row of its place in
+the lists; `projection_backward.sum_intersections` adds the rows up in a fixed order.
 """
 
 from functools import cache
@@ -47,7 +47,7 @@ def make_composite_backward_block(wide: bool, depth: bool, absolute: bool, order
         v_transmittance: wp.array2d[float],  # [H, W] its gradient
         v_image: wp.array3d[float],  # [H, W, C] gradient of the image
         v_depth: wp.array2d[float],  # [H, W] gradient of the depth sum (depth)
-        last: wp.array2d[int],  # [H, W] last contributing fragment, counted from its tile's first
+        last: wp.array2d[int],  # [H, W] last contributor, counted from its tile's first, -1 = none
         knobs: Knobs,
         width: int,
         height: int,

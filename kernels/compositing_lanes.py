@@ -1,6 +1,6 @@
 """Front-to-back compositing, lane schedule (CPU): a thread owns a tile, 16 pixels of one of its rows are one vector.
 
-Every kernel walks a tile's fragments front to back and, for each, only the rows its footprint touches. The state of a
+Every kernel walks a tile's list front to back and, for each, only the rows its footprint touches. The state of a
 row (transmittance, accumulated channels) lives in a small scratch that stays in the first-level cache; `slot` names
 the scratch of the host thread that runs the launch.
 """
@@ -98,13 +98,12 @@ def still_open(mask: int, state: wp.array3d[Lanes], slot: int) -> int:
 
 @cache
 def color_walk(depth: bool, record: bool) -> wp.Function:
-    """Device function that composites three channels of a tile into its scratch.
+    """Device function that composites the three channels that travel with the splats into a tile's scratch.
 
-    Fragments come in batches: first each is entered in the list of every row it reaches, then row by row the lists are
-    walked with the state of the row in registers.
+    Fragments come in batches, and row by row those that reach it are composited.
 
     Planes of the scratch: transmittance, three channels, with `depth` sum of alpha T z and the surface depth, with
-    `record` the last contributor. With both, the surface is kept as a place in the tile's list, not as a depth.
+    `record` the last contributor. With both, the surface is kept as a contributor, not as a depth.
     """
     planes = color_planes(depth, record)
     composite_row = row_walk(depth, record)
@@ -164,7 +163,7 @@ def color_planes(depth: bool, record: bool) -> int:
 
 @wp.func
 def latest(w: Lanes, k: float, last: Lanes) -> Lanes:
-    """k in the lanes to which its fragment contributes. Floats count exactly to 2^24 fragments of one tile."""
+    """k in the lanes to which its fragment contributes. Floats count exactly to 2^24 places of one tile."""
     newest = last
     for i in range(LANES):
         newest[i] = wp.where(w[i] > 0.0, k, last[i])
@@ -306,7 +305,7 @@ def add_products(
 def feature_walk(slices: int, record: bool) -> wp.Function:
     """Device function that composites 16 `slices` channels of a tile into its scratch.
 
-    Planes of the scratch: transmittance, the channels, with `record` the last contributing fragment.
+    Planes of the scratch: transmittance, the channels, with `record` the last contributor.
     """
     last_plane = 1 + PASS * slices
 

@@ -14,7 +14,7 @@ Along a row only u changes, and from row to row u and v change by b and c. So a 
 vectors, d its distance to the middle one of the rows at work, and the six moments follow once per fragment. Counted
 from the middle, d b stays as small as a tile, and nothing large cancels.
 
-The thread that owns a tile writes one row per intersection, so no two threads write the same memory.
+The thread that owns a tile writes one row for each place of its list, so no two threads write the same memory.
 """
 
 from functools import cache
@@ -22,14 +22,14 @@ from functools import cache
 import warp as wp
 
 from sgwarp.kernels.binning import AHEAD, TILE, fragment_of, prefetch
-from sgwarp.kernels.compositing_lanes import lane_alphas
+from sgwarp.kernels.compositing_rows import fragment_replay
 from sgwarp.kernels.gaussian import Splat
 from sgwarp.kernels.projection import Knobs
 from sgwarp.kernels.transmittance import HALF_ROW, LANE_OFFSETS, LANE_OPTIONS, LANES, LaneIds, Lanes
 
 wp.set_module_options(LANE_OPTIONS)
 
-MIN_PASSED = wp.constant(1.0e-6)  # 1 - alpha is never taken for less
+MIN_PASSED = 1.0e-6  # 1 - alpha is never taken for less
 MOST_COLUMNS = 12
 ROW = wp.constant(MOST_COLUMNS)
 SUMS = MOST_COLUMNS + MOST_COLUMNS // 2  # vectors of scratch per fragment: two levels of the tree that sums the lanes
@@ -61,21 +61,6 @@ def make_fold(half: int) -> wp.Function:
     return fold
 
 
-@wp.func
-def feature_value(
-    features: wp.array3d[Lanes], gaussian: int, gradient: wp.array3d[Lanes], y: int, column: int, slices: int
-) -> Lanes:
-    """sum_i x_i v_i at the 16 pixels of a row, over all slices of channels."""
-    even = Lanes(0.0)  # two sums in turn: one alone would wait for its own last addition
-    odd = Lanes(0.0)
-    for s in range(slices):
-        x = features[gaussian, s, 0]
-        for c in range(0, LANES, 2):
-            even += x[c] * gradient[y, column, LANES * s + c]
-            odd += x[c + 1] * gradient[y, column, LANES * s + c + 1]
-    return even + odd
-
-
 @cache
 def make_composite_backward(wide: bool, depth: bool, absolute: bool) -> wp.Kernel:
     """Kernel that differentiates compositing.
@@ -89,6 +74,7 @@ def make_composite_backward(wide: bool, depth: bool, absolute: bool) -> wp.Kerne
     at_depth, at_absolute, columns_of_row = row_columns(wide, depth, absolute)
     pairs = (columns_of_row + 1) // 2
     quads = (pairs + 1) // 2
+    replay_fragment = fragment_replay(wide, depth, absolute, MIN_PASSED)
     fold_8, fold_4, fold_2, fold_1 = (make_fold(half) for half in (8, 4, 2, 1))
 
     @wp.kernel(module="unique", module_options=LANE_OPTIONS, enable_backward=False)
@@ -138,84 +124,9 @@ def make_composite_backward(wide: bool, depth: bool, absolute: bool) -> wp.Kerne
                 order = newest - b
                 prefetch(splats, listed[first + wp.max(order - AHEAD, 0)])
                 f = fragment_of(splats, listed[first + order], x0, y0)
-                ramp = f.a * LANE_OFFSETS
-                middle_row = float((f.first_row + f.last_row) / 2)
-                g0 = Lanes(0.0)
-                g1 = Lanes(0.0)
-                g2 = Lanes(0.0)
-                red = Lanes(0.0)
-                green = Lanes(0.0)
-                blue = Lanes(0.0)
-                z = Lanes(0.0)
-                across = Lanes(0.0)
-                down = Lanes(0.0)
-                for row in range(f.first_row, f.last_row + 1):
-                    # Leaving early keeps the sums in registers: after an `if` Warp selects them through memory.
-                    if order > reach[slot, row]:
-                        continue
-                    alphas = lane_alphas(f, row, knobs)
-                    y = y0 + row
-                    last_order = last[y, column]
-                    T = state[slot, row, 0]
-                    behind = state[slot, row, 1]
-                    for i in range(LANES):
-                        alphas[i] = wp.where(order <= last_order[i], alphas[i], 0.0)
-                        T[i] = T[i] / wp.max(1.0 - alphas[i], MIN_PASSED)
-                    w = wp.cw_mul(alphas, T)
-                    value = Lanes(0.0)
-                    if wp.static(wide):
-                        value = feature_value(features, f.gaussian, gradient, y, column, features.shape[1])
-                    else:
-                        value = f.color[0] * gradient[y, column, 0]
-                        value += f.color[1] * gradient[y, column, 1]
-                        value += f.color[2] * gradient[y, column, 2]
-                        red += wp.cw_mul(w, gradient[y, column, 0])
-                        green += wp.cw_mul(w, gradient[y, column, 1])
-                        blue += wp.cw_mul(w, gradient[y, column, 2])
-                    if wp.static(depth):
-                        v_sum = gradient[y, column, gradient.shape[2] - 1]
-                        value += f.depth * v_sum
-                        z += wp.cw_mul(w, v_sum)
-                    excess = value - behind
-                    state[slot, row, 0] = T
-                    state[slot, row, 1] = behind + wp.cw_mul(alphas, excess)
-                    g = wp.cw_mul(w, excess)
-                    for i in range(LANES):
-                        g[i] = wp.where(alphas[i] < knobs.alpha_max, g[i], 0.0)
-                    d = float(row) - middle_row
-                    g0 += g
-                    g1 += d * g
-                    g2 += (d * d) * g
-                    if wp.static(absolute):
-                        dy = float(row) - f.y
-                        middle = f.b * dy + f.a * (HALF_ROW - f.x)
-                        for i in range(LANES):
-                            g_u = g[i] * (ramp[i] + middle)
-                            across[i] = across[i] + wp.abs(f.a * g_u)
-                            down[i] = down[i] + wp.abs(f.b * g_u + f.c * f.c * dy * g[i])
-                v = f.c * (middle_row - f.y)
-                u = ramp
-                middle = f.b * (middle_row - f.y) + f.a * (HALF_ROW - f.x)
-                for i in range(LANES):
-                    u[i] = ramp[i] + middle
-                gu = wp.cw_mul(u, g0) + f.b * g1
-                gv = v * g0 + f.c * g1
-                gu1 = wp.cw_mul(u, g1) + f.b * g2
-                sums[slot, b, 0] = g0
-                sums[slot, b, 1] = gu
-                sums[slot, b, 2] = gv
-                sums[slot, b, 3] = wp.cw_mul(u, gu) + f.b * gu1
-                sums[slot, b, 4] = v * gu + f.c * gu1
-                sums[slot, b, 5] = v * gv + f.c * (v * g1 + f.c * g2)
-                if wp.static(not wide):
-                    sums[slot, b, 6] = red
-                    sums[slot, b, 7] = green
-                    sums[slot, b, 8] = blue
-                if wp.static(depth):
-                    sums[slot, b, at_depth] = z
-                if wp.static(absolute):
-                    sums[slot, b, at_absolute] = across
-                    sums[slot, b, wp.static(at_absolute + 1)] = down
+                replay_fragment(
+                    slot, b, order, column, y0, f, features, last, gradient, knobs, state, reach, sums
+                )
             # Column q ends up in lane q. Level by level over the whole batch: what was stored just now cannot be read
             # in other pieces without waiting.
             for b in range(size):

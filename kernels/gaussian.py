@@ -1,4 +1,4 @@
-"""Device functions of one Gaussian: camera frame, projected covariance, footprint, alpha.
+"""Device functions of one Gaussian: camera frame, projected covariance, footprint.
 
 Conventions: OpenCV camera axes (x right, y down, z forward), quaternions (w, x, y, z), pixel centres at .5.
 

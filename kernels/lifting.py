@@ -63,17 +63,17 @@ def localize_ids(
 @wp.kernel
 def sum_rows(
     # In:
-    base: int,  # first entry of `order` in this launch
+    base: int,  # first rank of this launch
     order: wp.array[int],  # [V] visible Gaussians
-    entries: wp.array[int],  # [V + 1] first intersection of each
-    places: wp.array[int],  # [I] where each intersection stands in the tile lists
+    entries: wp.array[int],  # [V + 1] first entry of each
+    places: wp.array[int],  # [I] place of each entry in the tile lists
     rows: wp.array2d[Lanes],  # [I, slices] by place
     first_slice: int,  # of this pass
     slices: int,
     # Out:
     features_out: wp.array2d[Lanes],  # [N, S] added to
 ):
-    """Add the rows of each Gaussian's intersections, in order. One thread per visible Gaussian."""
+    """Add the rows of each Gaussian's entries, in order. One thread per visible Gaussian."""
     k = base + wp.tid()
     i = order[k]
     for s in range(slices):
@@ -112,12 +112,12 @@ def sum_id_weights(
     order: wp.array[int],  # [V]
     entries: wp.array[int],  # [V + 1]
     places: wp.array[int],  # [I]
-    starts: wp.array[int],  # [I] first weight of each intersection, by place
-    tiles: wp.array[int],  # [I] tile of each intersection, by splat
+    starts: wp.array[int],  # [I] first weight of each place
+    tiles: wp.array[int],  # [I] tile of each entry
     tile_ids: wp.array2d[int],  # [tiles, 256]
     tile_id_counts: wp.array[int],  # [tiles]
-    weights: wp.array[float],  # per fragment one weight for each id of its tile
-    by_gaussian: int,  # 1: rows of id_weights_out are Gaussians, 0: they are places in `order`
+    weights: wp.array[float],  # for each place one weight per id of its tile
+    by_gaussian: int,  # 1: rows of id_weights_out are Gaussians, 0: they are ranks
     # Out:
     id_weights_out: wp.array2d[float],  # [V or N, M] added to
     weight_out: wp.array[float],  # [N] added to

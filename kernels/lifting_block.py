@@ -2,8 +2,8 @@
 
 For a batch of 16 fragments each thread computes the weight of its own pixel, then thread (fragment, channel)
 multiplies the 16 x 256 weights by the 256 x 16 features. Its sum goes to the Gaussian by one atomic addition per
-(tile, fragment, channel) or, in the ordered variant, to the row of its intersection, which `lifting.sum_rows` adds up
-in a fixed order.
+(tile, fragment, channel) or, in the ordered variant, to the row of its place in the lists; `lifting.sum_rows` adds the
+rows up in a fixed order.
 """
 
 from functools import cache
@@ -23,7 +23,7 @@ BATCH = LANES  # fragments whose weights meet the features at a time
 
 @cache
 def make_lift_dense_block(ordered: bool) -> wp.Kernel:
-    """Kernel that lifts a dense map: atomic additions, or one row per intersection if `ordered`."""
+    """Kernel that lifts a dense map: atomic additions, or one row for each place if `ordered`."""
 
     @wp.kernel(module="unique", module_options=BLOCK_OPTIONS, enable_backward=False)
     def lift_dense_block(
@@ -40,7 +40,7 @@ def make_lift_dense_block(ordered: bool) -> wp.Kernel:
         height: int,
         # Out:
         sums_out: wp.array2d[float],  # [N, C] added to, or [I, C of this pass] by place
-        weights_out: wp.array[float],  # [N] added to, or [I]; written in the first slice of a pass
+        weights_out: wp.array[float],  # [N] added to, or [I] by place; written in the first slice of a pass
     ):
         """A^T f; one block per (tile, slice)."""
         tile, s, t = wp.tid()
@@ -94,7 +94,7 @@ def make_lift_dense_block(ordered: bool) -> wp.Kernel:
 
 @cache
 def make_lift_ids_block(ordered: bool) -> wp.Kernel:
-    """Kernel that lifts an id map: atomic additions per (Gaussian, id), or per-fragment weights if `ordered`."""
+    """Kernel that lifts an id map: atomic additions per (Gaussian, id), or weights for each place if `ordered`."""
 
     @wp.kernel(module="unique", module_options=BLOCK_OPTIONS, enable_backward=False)
     def lift_ids_block(
@@ -112,8 +112,8 @@ def make_lift_ids_block(ordered: bool) -> wp.Kernel:
         # Out:
         id_weights_out: wp.array2d[float],  # [N, M] added to (atomic variant)
         view_weights_out: wp.array[float],  # [N] added to (atomic variant)
-        weights_out: wp.array[float],  # per fragment one weight for each id of its tile (ordered variant)
-        starts_out: wp.array[int],  # [I] first weight of each intersection, by place (ordered variant)
+        weights_out: wp.array[float],  # for each place one weight per id of its tile (ordered variant)
+        starts_out: wp.array[int],  # [I] first weight of each place (ordered variant)
     ):
         """Sum of alpha T by id; one block per tile, 16 ids at a time."""
         tile, t = wp.tid()

@@ -2,8 +2,8 @@
 
 The renderer is a matrix A with one entry alpha T per (pixel, Gaussian); lifting applies its transpose to a feature
 map. The thread that owns a tile sums each fragment's contribution over the tile's pixels in registers and writes one
-row per intersection; `lifting.py` adds up the rows of each Gaussian. No two threads write the same memory, so the
-result has the same bits for any number of threads.
+row for each place of its list; `lifting.py` adds up the rows of each Gaussian. No two threads write the same memory, so
+the result has the same bits for any number of threads.
 """
 
 from functools import cache
@@ -67,7 +67,7 @@ def make_lift_dense(slices: int) -> wp.Kernel:
         state: wp.array3d[Lanes],  # [slots, 16, 1] scratch
         # Out:
         rows_out: wp.array2d[Lanes],  # [I, slices] sum over the tile's pixels of alpha T f, by place
-        weights_out: wp.array[float],  # [I] sum of alpha T over the pixels that carry semantics
+        weights_out: wp.array[float],  # [I] sum of alpha T over the pixels that carry semantics, by place
     ):
         """A^T f for one tile per thread."""
         tile = base + wp.tid()
@@ -144,8 +144,8 @@ def lift_ids(
     height: int,
     state: wp.array3d[Lanes],  # [slots, 16, 1] scratch
     # Out:
-    weights_out: wp.array[float],  # zeroed; per fragment one weight for each id of its tile
-    starts_out: wp.array[int],  # [I] first weight of each intersection, by place
+    weights_out: wp.array[float],  # zeroed; for each place one weight per id of its tile
+    starts_out: wp.array[int],  # [I] first weight of each place
 ):
     """Sum of alpha T by id: the cost does not depend on the number of feature channels."""
     tile = base + wp.tid()

@@ -54,7 +54,7 @@ def is_finite(mean: wp.vec3, quat: wp.vec4, scale: wp.vec3, opacity: float) -> b
 def is_far_off_screen(camera: Pinhole, point: wp.vec3, scale: wp.vec3, knobs: Knobs) -> bool:
     """Whether not even a round, opaque Gaussian of the largest scale would reach the image: no square root is needed.
 
-    Its standard deviation along an image axis is at most scale |J row|, its footprint sqrt(2 ln(1 / alpha_min)) of that.
+    Its deviation along an image axis is at most scale |J row|, its footprint sqrt(2 ln(1 / alpha_min)) times that.
     """
     row_x, row_y = ewa_rows(camera, point)
     largest = wp.max(scale)

@@ -40,15 +40,15 @@ def prefetch_row(rows: wp.array[Lanes], places: wp.array[int], entry: int): ... 
 @wp.kernel
 def sum_intersections(
     # In:
-    base: int,  # first entry of `order` in this launch
+    base: int,  # first rank of this launch
     order: wp.array[int],  # [V] Gaussians
-    entries: wp.array[int],  # [V + 1] first intersection of each
-    places: wp.array[int],  # [I] where each intersection stands in the tile lists
+    entries: wp.array[int],  # [V + 1] first entry of each
+    places: wp.array[int],  # [I] place of each entry in the tile lists
     rows: wp.array[Lanes],  # [I] by place
     # Out:
     sums_out: wp.array[Lanes],  # [N] zeroed
 ):
-    """Add the rows of each Gaussian's intersections, in order, and mark the Gaussian as seen."""
+    """Add the rows of each Gaussian's entries, in order, and mark the Gaussian as seen."""
     k = base + wp.tid()
     first = entries[k]
     last = entries[k + 1]
