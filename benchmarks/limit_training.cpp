@@ -1,0 +1,175 @@
+// The limit of a training step: Gaussians to image and back by hand, everything kept in memory that is used again.
+#include "limit_harmonics.h"
+#include "limit_lists.h"
+#include "limit_walk.h"
+
+namespace {
+
+// What a tile leaves for its backward pass.
+struct Tile {
+  Lanes T[TILE];  // transmittance behind everything
+  int32_t thread;
+  size_t end;     // of its masks among those of the thread
+};
+
+// What both passes share; `seconds` holds the stages' wall times, see STAGES in limit_training.py.
+struct Workspace {
+  Camera camera;
+  Gaussians gaussians;
+  int threads;
+  Buffer<Splat> splats;    // [N], chunk by chunk without gaps
+  Buffer<Group> groups;    // [N / 16]
+  Buffer<int32_t> held, starts;  // [chunks], [chunks + 1]
+  DepthOrder depth;
+  TileLists lists;
+  Buffer<Tile> tiles;
+  Buffer<uint16_t> rows;                 // [I] see Recorded
+  std::vector<std::vector<Mask>> masks;  // of every thread
+  Buffer<float> totals;    // [threads, N, 16]
+  double seconds[9], clock;
+
+  int chunks() const { return (gaussians.count + CHUNK - 1) / CHUNK; }
+  int group_count() const { return (gaussians.count + 15) / 16; }
+  Scene scene() const { return {camera.width, camera.height, lists.offsets.data, lists.ids.data, splats.data}; }
+  void start() { clock = omp_get_wtime(); }
+  void lap(int stage) {
+    const double now = omp_get_wtime();
+    seconds[stage] = now - clock, clock = now;
+  }
+
+  void project() {
+    const int n = gaussians.count;
+    splats.reserve(n), groups.reserve(group_count()), held.reserve(chunks()), starts.reserve(chunks() + 1);
+#pragma omp parallel for num_threads(threads) schedule(dynamic, 1)
+    for (int c = 0; c < chunks(); c++) {
+      int32_t next = CHUNK * c;
+      for (int first = CHUNK * c; first < std::min(CHUNK * (c + 1), n); first += 16) {
+        Group &group = groups[first / 16];
+        group.first = next;
+        group.visible = project_group(gaussians, camera, first, &splats[next]);
+        next += __builtin_popcount(group.visible);
+      }
+      held[c] = next - CHUNK * c;
+    }
+    starts[0] = 0;
+    for (int c = 0; c < chunks(); c++) starts[c + 1] = starts[c] + held[c];
+  }
+
+  void shade() {
+#pragma omp parallel for num_threads(threads) schedule(static)
+    for (int group = 0; group < group_count(); group++)
+      if (groups[group].visible) shade_group(gaussians, camera, 16 * group, groups[group], &splats[groups[group].first]);
+  }
+
+  void composite(float *rgb, float *alpha) {
+    const Scene view = scene();
+    tiles.reserve(view.tiles());
+    rows.reserve(lists.offsets[view.tiles()]);
+    masks.resize(threads);
+#pragma omp parallel num_threads(threads)
+    {
+      const int thread = omp_get_thread_num();
+      size_t used = 0;
+#pragma omp for schedule(dynamic, 4)
+      for (int tile = 0; tile < view.tiles(); tile++) {
+        Recorded sink(view, tile, rows.data, masks[thread], used);
+        walk(view, tile, tiles[tile].T, sink);
+        sink.write(view, tile, tiles[tile].T, rgb, alpha);
+        tiles[tile].thread = thread;
+        tiles[tile].end = used = sink.used;
+      }
+    }
+  }
+
+  void composite_backward(const float *v_rgb, const float *v_alpha) {
+    const Scene view = scene();
+    const size_t size = (size_t)16 * gaussians.count;
+    totals.reserve(size * threads);
+#pragma omp parallel num_threads(threads)
+    {
+      float *mine = totals.data + size * omp_get_thread_num();
+      for (int c = 0; c < chunks(); c++) std::memset(mine + (size_t)16 * CHUNK * c, 0, sizeof(float) * 16 * held[c]);
+#pragma omp for schedule(dynamic, 4)
+      for (int tile = 0; tile < view.tiles(); tile++) {
+        const Mask *end = masks[tiles[tile].thread].data() + tiles[tile].end;
+        walk_back(view, tile, tiles[tile].T, rows.data, end, v_rgb, v_alpha, mine);
+      }
+    }
+  }
+
+  void add_totals() {
+    const size_t size = (size_t)16 * gaussians.count;
+#pragma omp parallel for num_threads(threads) schedule(static)
+    for (int c = 0; c < chunks(); c++) {
+      float *first = totals.data + (size_t)16 * CHUNK * c;
+      for (int thread = 1; thread < threads; thread++)
+        for (int i = 0; i < 16 * held[c]; i++) first[i] += first[size * thread + i];
+    }
+  }
+
+  // Sums of the 16 Gaussians of a group, zero for the invisible: rows[q] holds sum q.
+  void load_totals(int group, Lanes *rows) {
+    const float *total = totals.data + (size_t)16 * groups[group].first;
+    for (int i = 0; i < 16; i++) {
+      const bool visible = groups[group].visible >> i & 1;
+      rows[i] = load_if(visible, total), total += 16 * visible;
+    }
+    transpose(rows);
+  }
+
+  void project_backward(float *v_means, float *v_quats, float *v_scales, float *v_opacities) {
+#pragma omp parallel for num_threads(threads) schedule(static)
+    for (int group = 0; group < group_count(); group++) {
+      Lanes rows[16];
+      load_totals(group, rows);
+      project_group_backward(gaussians, camera, 16 * group, groups[group].visible, rows, v_means, v_quats, v_scales,
+                             v_opacities);
+    }
+  }
+
+  void shade_backward(float *v_means, float *v_sh) {
+#pragma omp parallel for num_threads(threads) schedule(static)
+    for (int group = 0; group < group_count(); group++) {
+      Lanes rows[16];
+      load_totals(group, rows);
+      shade_group_backward(gaussians, camera, 16 * group, groups[group], rows + 6, v_means, v_sh);
+    }
+  }
+};
+
+}  // namespace
+
+extern "C" Workspace *workspace_new() { return new Workspace(); }
+
+extern "C" void workspace_delete(Workspace *workspace) { delete workspace; }
+
+// rgb [H, W, 3], alpha [H, W]; the arrays of Gaussians stay where they are until the backward pass. Returns how many
+// intersections there are.
+extern "C" int forward(Workspace *w, const Camera *camera, int count, const float *means, const float *quats,
+                       const float *scales, const float *opacities, const float *sh, int threads, float *rgb,
+                       float *alpha, double *seconds) {
+  w->camera = *camera;
+  w->gaussians = {count, means, quats, scales, opacities, sh};
+  w->threads = threads;
+  w->start();
+  w->project(), w->lap(0);
+  w->depth.sort(w->splats.data, w->held.data, w->starts.data, w->chunks(), threads), w->lap(1);
+  w->shade(), w->lap(2);
+  const int visible = w->starts[w->chunks()];
+  const int total = w->lists.build(w->splats.data, w->depth.order.data, visible, camera->width, camera->height, threads);
+  w->lap(3);
+  w->composite(rgb, alpha), w->lap(4);
+  std::memcpy(seconds, w->seconds, sizeof(double) * 5);
+  return total;
+}
+
+// Of the last forward pass: v_rgb [H, W, 3] and v_alpha [H, W] to the gradients of everything. v_sh is aligned to 64 bytes.
+extern "C" void backward(Workspace *w, const float *v_rgb, const float *v_alpha, float *v_means, float *v_quats,
+                         float *v_scales, float *v_opacities, float *v_sh, double *seconds) {
+  w->start();
+  w->composite_backward(v_rgb, v_alpha), w->lap(5);
+  w->add_totals(), w->lap(6);
+  w->project_backward(v_means, v_quats, v_scales, v_opacities), w->lap(7);
+  w->shade_backward(v_means, v_sh), w->lap(8);
+  std::memcpy(seconds, w->seconds + 5, sizeof(double) * 4);
+}
