@@ -112,10 +112,12 @@ void multiply(const Pairs &pairs, size_t first, size_t last, const Lanes *slice,
 
 }  // namespace
 
-extern "C" void composite(int n, const float *mean2d, const float *conic, const float *opacity, const float *color,
-                          int width, int height, const int32_t *offsets, const int32_t *ids, int threads, float *rgb,
-                          float *alpha) {
+// Returns the seconds that compositing takes once the splats are packed, as they are in the package.
+extern "C" double composite(int n, const float *mean2d, const float *conic, const float *opacity, const float *color,
+                            int width, int height, const int32_t *offsets, const int32_t *ids, int threads,
+                            float *rgb, float *alpha) {
   const Scene scene = {width, height, offsets, ids, splats_of(n, mean2d, conic, opacity, color, threads)};
+  const double start = omp_get_wtime();
 #pragma omp parallel for schedule(dynamic, 4) num_threads(threads)
   for (int tile = 0; tile < scene.tiles(); tile++) {
     Lanes T[TILE];
@@ -123,6 +125,7 @@ extern "C" void composite(int n, const float *mean2d, const float *conic, const 
     walk(scene, tile, T, colors);
     colors.write(scene, tile, T, rgb, alpha);
   }
+  return omp_get_wtime() - start;
 }
 
 // image [H, W] holds ids below channels, -1 for none; features [n, channels] is added to.

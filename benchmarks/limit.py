@@ -75,11 +75,16 @@ def composite(
     height: int,
     threads: int = 1,
     out: tuple[np.ndarray, np.ndarray] | None = None,
-) -> tuple[np.ndarray, np.ndarray]:
-    """Composite colours float32 [M, 3] over black: float32 [H, W, 3] and alpha [H, W]."""
+) -> tuple[np.ndarray, np.ndarray, float]:
+    """Composite colours float32 [M, 3] over black: float32 [H, W, 3], alpha [H, W] and the time taken [s].
+
+    The time does not hold the packing of the splats, which the package's tile lists have behind them.
+    """
     n, f = len(opacity), np.float32
     rgb, alpha = out or (np.empty((height, width, 3), f), np.empty((height, width), f))
-    library("limit").composite(
+    run = library("limit").composite
+    run.restype = ctypes.c_double
+    seconds = run(
         n,
         pointer(mean2d, f, (n, 2)),
         pointer(conic, f, (n, 3)),
@@ -92,7 +97,7 @@ def composite(
         pointer(rgb, f, (height, width, 3)),
         pointer(alpha, f, (height, width)),
     )
-    return rgb, alpha
+    return rgb, alpha, seconds
 
 
 def lift_ids(
@@ -182,7 +187,7 @@ def self_check(threads: int = 2) -> dict[str, float]:
     camera = camera.resized(101, 150)
     p = projected(gaussians, camera)
     raster = rasterize(gaussians, camera)
-    rgb, alpha = composite(p.mean2d, p.conic, p.opacity, p.color, p.offsets, p.ids, p.width, p.height, threads)
+    rgb, alpha, _ = composite(p.mean2d, p.conic, p.opacity, p.color, p.offsets, p.ids, p.width, p.height, threads)
     clear = ((raster.margin > 1e-4) & (raster.order_margin > 2e-6)).numpy()
     errors = {
         "image": float(np.abs(rgb - raster.features.numpy())[clear].max()),

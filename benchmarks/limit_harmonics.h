@@ -41,7 +41,7 @@ inline void shade_group(const Gaussians &g, const Camera &c, int first, Group &g
   basis(direction, Y);
   for (int j = 0; j < 3; j++) color[j] = all(0.5f);
   for (int third = 0; third < 3; third++) {
-    load_third(g.sh, first, group.visible, third, rows);
+    load_third(g.values, first, group.visible, third, rows);
     for (int e = 0; e < 16; e++) color[(16 * third + e) % 3] += Y[(16 * third + e) / 3] * rows[e];
   }
   float values[3][16];
@@ -69,7 +69,7 @@ inline void shade_group_backward(const Gaussians &g, const Camera &c, int first,
   for (int k = 0; k < 16; k++) Y[k] = masked(group.visible, Y[k]);
   for (int j = 0; j < 3; j++) v[j] = masked(group.shown[j], v_color[j]);
   for (int third = 0; third < 3; third++) {
-    load_third(g.sh, first, group.visible, third, rows);
+    load_third(g.values, first, group.visible, third, rows);
     for (int e = 0; e < 16; e++) s[(16 * third + e) / 3] += rows[e] * v[(16 * third + e) % 3];
     for (int e = 0; e < 16; e++) rows[e] = Y[(16 * third + e) / 3] * v[(16 * third + e) % 3];
     transpose(rows);

@@ -36,6 +36,9 @@ inline Mask greater_equal(Lanes a, Lanes b, Mask where = 0xffff) {
 }
 inline Mask greater(Lanes a, Lanes b, Mask where) { return _mm512_mask_cmp_ps_mask(where, a, b, _CMP_GT_OQ); }
 inline Mask equal(Ints a, int32_t b) { return _mm512_cmpeq_epi32_mask((__m512i)a, _mm512_set1_epi32(b)); }
+inline uint32_t having(const uint16_t *values, int bit) {  // which of 32 values, aligned to 64 bytes, have a bit set
+  return _mm512_test_epi16_mask(_mm512_load_si512(values), _mm512_set1_epi16(1 << bit));
+}
 inline Lanes select(Mask mask, Lanes yes, Lanes no) { return _mm512_mask_blend_ps(mask, no, yes); }
 inline Lanes masked(Mask mask, Lanes value) { return _mm512_maskz_mov_ps(mask, value); }
 inline Lanes smaller(Lanes a, Lanes b) { return _mm512_min_ps(a, b); }
@@ -76,6 +79,11 @@ inline Mask greater_equal(Lanes a, Lanes b, Mask where = 0xffff) {
 }
 inline Mask greater(Lanes a, Lanes b, Mask where) { return where & bits([&](int i) { return a[i] > b[i]; }); }
 inline Mask equal(Ints a, int32_t b) { return bits([&](int i) { return a[i] == b; }); }
+inline uint32_t having(const uint16_t *values, int bit) {
+  uint32_t result = 0;
+  for (int i = 0; i < 32; i++) result |= (uint32_t)(values[i] >> bit & 1) << i;
+  return result;
+}
 inline Lanes select(Mask m, Lanes yes, Lanes no) { return lanes([&](int i) { return m >> i & 1 ? yes[i] : no[i]; }); }
 inline Lanes masked(Mask mask, Lanes value) { return select(mask, value, Lanes{}); }
 inline Lanes smaller(Lanes a, Lanes b) { return lanes([&](int i) { return a[i] < b[i] ? a[i] : b[i]; }); }

@@ -25,11 +25,13 @@ struct alignas(64) Splat {
   float r, g, b;
   float half_width, half_height;  // of the footprint [pixels]
   float depth;                    // [m]
+  int32_t gaussian;
 };
 
 struct Gaussians {
   int count;
-  const float *means, *quats, *scales, *opacities, *sh;  // [N, 3], [N, 4], [N, 3], [N], [N, 16, 3]
+  const float *means, *quats, *scales, *opacities;  // [N, 3], [N, 4], [N, 3], [N]
+  const float *values;                              // coefficients [N, 16, 3] or features
 };
 
 // What a pass over the visible Gaussians needs to find their splats, for every 16 Gaussians.
@@ -139,6 +141,7 @@ inline Mask project_group(const Gaussians &g, const Camera &c, int first, Splat 
   row[2] = -0.5f * sharp * s.yy, row[3] = sharp * s.xy, row[4] = -0.5f * sharp * s.xx, row[5] = level;
   row[6] = s.xy / s.yy;
   row[10] = half_width, row[11] = half_height, row[12] = s.point[2];
+  for (int i = 0; i < 16; i++) ((int32_t *)&row[13])[i] = first + i;
   transpose(row);
   for (uint32_t left = visible; left; left &= left - 1) store((float *)out++, row[__builtin_ctz(left)]);
   return visible;

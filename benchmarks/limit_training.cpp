@@ -1,4 +1,5 @@
 // The limit of a training step: Gaussians to image and back by hand, everything kept in memory that is used again.
+#include "limit_features.h"
 #include "limit_harmonics.h"
 #include "limit_lists.h"
 #include "limit_walk.h"
@@ -8,8 +9,8 @@ namespace {
 // What a tile leaves for its backward pass.
 struct Tile {
   Lanes T[TILE];  // transmittance behind everything
-  int32_t thread;
-  size_t end;     // of its masks among those of the thread
+  int32_t thread, batches;
+  size_t end;     // of its masks or items among those of the thread
 };
 
 // What both passes share; `seconds` holds the stages' wall times, see STAGES in limit_training.py.
@@ -25,6 +26,8 @@ struct Workspace {
   Buffer<Tile> tiles;
   Buffer<uint16_t> rows;                 // [I] see Recorded
   std::vector<std::vector<Mask>> masks;  // of every thread
+  std::vector<std::vector<Item>> items;  // the same for features
+  Buffer<std::atomic_flag> locks;        // [N]
   Buffer<float> totals;    // [threads, N, 16]
   double seconds[9], clock;
 
@@ -81,14 +84,60 @@ struct Workspace {
     }
   }
 
-  void composite_backward(const float *v_rgb, const float *v_alpha) {
+  template <int S> void composite_channels(const float *features, float *image, float *alpha) {
     const Scene view = scene();
-    const size_t size = (size_t)16 * gaussians.count;
-    totals.reserve(size * threads);
+    tiles.reserve(view.tiles());
+    items.resize(threads);
 #pragma omp parallel num_threads(threads)
     {
-      float *mine = totals.data + size * omp_get_thread_num();
-      for (int c = 0; c < chunks(); c++) std::memset(mine + (size_t)16 * CHUNK * c, 0, sizeof(float) * 16 * held[c]);
+      static thread_local FeatureScratch<S> scratch;
+      const int thread = omp_get_thread_num();
+      size_t used = 0;
+#pragma omp for schedule(dynamic, 4)
+      for (int tile = 0; tile < view.tiles(); tile++) {
+        Tile &t = tiles[tile];
+        t.batches = composite_features<S>(view, tile, features, scratch, t.T, items[thread], used, image, alpha);
+        t.thread = thread, t.end = used;
+      }
+    }
+  }
+
+  // This thread's sums, zero for every splat.
+  float *fresh_totals() {
+    float *mine = totals.data + (size_t)16 * gaussians.count * omp_get_thread_num();
+    for (int c = 0; c < chunks(); c++) std::memset(mine + (size_t)16 * CHUNK * c, 0, sizeof(float) * 16 * held[c]);
+    return mine;
+  }
+
+  template <int S>
+  void composite_channels_backward(const float *features, const float *v_image, const float *v_alpha,
+                                   float *v_features) {
+    const Scene view = scene();
+    totals.reserve((size_t)16 * gaussians.count * threads), locks.reserve(gaussians.count);
+#pragma omp parallel num_threads(threads)
+    {
+      static thread_local FeatureScratch<S> scratch;
+      float *mine = fresh_totals();
+#pragma omp for schedule(static)
+      for (int c = 0; c < chunks(); c++) {
+        const size_t first = (size_t)16 * S * CHUNK * c, last = (size_t)16 * S * std::min(CHUNK * (c + 1), gaussians.count);
+        std::memset(v_features + first, 0, sizeof(float) * (last - first));
+      }
+#pragma omp for schedule(dynamic, 4)
+      for (int tile = 0; tile < view.tiles(); tile++) {
+        const Tile &t = tiles[tile];
+        composite_features_back<S>(view, tile, t.batches, t.T, items[t.thread].data() + t.end, features, v_image,
+                                   v_alpha, scratch, mine, v_features, locks.data);
+      }
+    }
+  }
+
+  void composite_backward(const float *v_rgb, const float *v_alpha) {
+    const Scene view = scene();
+    totals.reserve((size_t)16 * gaussians.count * threads);
+#pragma omp parallel num_threads(threads)
+    {
+      float *mine = fresh_totals();
 #pragma omp for schedule(dynamic, 4)
       for (int tile = 0; tile < view.tiles(); tile++) {
         const Mask *end = masks[tiles[tile].thread].data() + tiles[tile].end;
@@ -143,33 +192,44 @@ extern "C" Workspace *workspace_new() { return new Workspace(); }
 
 extern "C" void workspace_delete(Workspace *workspace) { delete workspace; }
 
-// rgb [H, W, 3], alpha [H, W]; the arrays of Gaussians stay where they are until the backward pass. Returns how many
-// intersections there are.
+// values [N, 16, 3] are coefficients where channels is 3, else features [N, channels], channels 16 or 64. image [H, W,
+// channels], alpha [H, W]. The arrays stay where they are until the backward pass. Returns how many intersections there are.
 extern "C" int forward(Workspace *w, const Camera *camera, int count, const float *means, const float *quats,
-                       const float *scales, const float *opacities, const float *sh, int threads, float *rgb,
-                       float *alpha, double *seconds) {
+                       const float *scales, const float *opacities, const float *values, int channels, int threads,
+                       float *image, float *alpha) {
   w->camera = *camera;
-  w->gaussians = {count, means, quats, scales, opacities, sh};
+  w->gaussians = {count, means, quats, scales, opacities, values};
   w->threads = threads;
   w->start();
   w->project(), w->lap(0);
   w->depth.sort(w->splats.data, w->held.data, w->starts.data, w->chunks(), threads), w->lap(1);
-  w->shade(), w->lap(2);
+  if (channels == 3) w->shade();
+  w->lap(2);
   const int visible = w->starts[w->chunks()];
   const int total = w->lists.build(w->splats.data, w->depth.order.data, visible, camera->width, camera->height, threads);
   w->lap(3);
-  w->composite(rgb, alpha), w->lap(4);
-  std::memcpy(seconds, w->seconds, sizeof(double) * 5);
+  if (channels == 3) w->composite(image, alpha);
+  if (channels == 16) w->composite_channels<1>(values, image, alpha);
+  if (channels == 64) w->composite_channels<4>(values, image, alpha);
+  w->lap(4);
   return total;
 }
 
-// Of the last forward pass: v_rgb [H, W, 3] and v_alpha [H, W] to the gradients of everything. v_sh is aligned to 64 bytes.
-extern "C" void backward(Workspace *w, const float *v_rgb, const float *v_alpha, float *v_means, float *v_quats,
-                         float *v_scales, float *v_opacities, float *v_sh, double *seconds) {
+// Of the last forward pass: v_image [H, W, channels] and v_alpha [H, W] to the gradients of everything. v_values is
+// aligned to 64 bytes.
+extern "C" void backward(Workspace *w, const float *v_image, const float *v_alpha, int channels, float *v_means,
+                         float *v_quats, float *v_scales, float *v_opacities, float *v_values) {
+  const float *values = w->gaussians.values;
   w->start();
-  w->composite_backward(v_rgb, v_alpha), w->lap(5);
+  if (channels == 3) w->composite_backward(v_image, v_alpha);
+  if (channels == 16) w->composite_channels_backward<1>(values, v_image, v_alpha, v_values);
+  if (channels == 64) w->composite_channels_backward<4>(values, v_image, v_alpha, v_values);
+  w->lap(5);
   w->add_totals(), w->lap(6);
   w->project_backward(v_means, v_quats, v_scales, v_opacities), w->lap(7);
-  w->shade_backward(v_means, v_sh), w->lap(8);
-  std::memcpy(seconds, w->seconds + 5, sizeof(double) * 4);
+  if (channels == 3) w->shade_backward(v_means, v_values);
+  w->lap(8);
 }
+
+// Wall times of the last passes' nine stages.
+extern "C" void stage_seconds(const Workspace *w, double *seconds) { std::memcpy(seconds, w->seconds, sizeof w->seconds); }

@@ -1,19 +1,22 @@
 """The limit of a training step: the whole pipeline by hand in C++ (limit_training.cpp), forward and backward.
 
-The same work as `rasterize_differentiable` with colours of degree 3, and the same results: image, alpha and the
-gradients of every parameter. What it leaves out is what the package promises and a limit need not: sums in an order
-that no number of threads changes, whitened moments for needles, the split centre for far origins, settings.
+The same work as `rasterize_differentiable`, with colours of degree 3 or with features, and the same results: image,
+alpha and the gradients of every parameter. What it leaves out is what the package promises and a limit need not: sums
+in an order that no number of threads changes, whitened moments for needles, the split centre for far origins, settings.
 """
 
 from __future__ import annotations
 
 import ctypes
 import weakref
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 
 import numpy as np
+import torch
 from limit import library, pointer
+from torch import Tensor
 
+from sgwarp.ops import reference
 from sgwarp.scene import Camera, Gaussians
 
 STAGES = (
@@ -27,8 +30,9 @@ STAGES = (
     "project backward",
     "shade backward",
 )
-FORWARD = 5  # of them belong to the forward pass
 COEFFICIENTS = 16
+CHANNELS = (16, 64)  # of features
+PARAMETERS = ("means", "quats", "scales", "opacities")
 
 
 class _Camera(ctypes.Structure):
@@ -50,20 +54,27 @@ def _camera(camera: Camera) -> _Camera:
     fx, fy, cx, cy = (camera.K[i, j].item() for i, j in ((0, 0), (1, 1), (0, 2), (1, 2)))
     low = [-(cx + 0.15 * camera.width) / fx, -(cy + 0.15 * camera.height) / fy]
     high = [(1.15 * camera.width - cx) / fx, (1.15 * camera.height - cy) / fy]
-    arrays = (camera.world_to_camera[:3, :3].flatten().tolist(), camera.position.tolist(), [fx, fy], [cx, cy], low, high)
+    arrays = (
+        camera.world_to_camera[:3, :3].flatten().tolist(),
+        camera.position.tolist(),
+        [fx, fy],
+        [cx, cy],
+        low,
+        high,
+    )
     parts = (kind(*values) for (_, kind), values in zip(_Camera._fields_, arrays, strict=False))
     return _Camera(*parts, camera.near, camera.far, camera.width, camera.height)
 
 
 @dataclass(frozen=True, eq=False)
 class Gradients:
-    """As Gaussians, float32: means [N, 3], quats [N, 4], scales [N, 3], opacities [N], sh [N, 16, 3]."""
+    """Float32: means [N, 3], quats [N, 4], scales [N, 3], opacities [N], values [N, 16, 3] or [N, channels]."""
 
     means: np.ndarray
     quats: np.ndarray
     scales: np.ndarray
     opacities: np.ndarray
-    sh: np.ndarray
+    values: np.ndarray
 
 
 def _aligned(shape: tuple[int, ...]) -> np.ndarray:
@@ -78,56 +89,63 @@ class TrainingLimit:
     """One scene in one view. All memory is kept: only the first call pays for it.
 
     Args:
-        gaussians: On the CPU, with 16 coefficients per colour.
+        gaussians: On the CPU; their coefficients are read unless there are features.
         camera: The view.
         threads: Of OpenMP.
+        features: Float32 [N, 16] or [N, 64], composited in place of the colours.
 
     Attributes:
-        rgb, alpha: The image, float32 [H, W, 3] and [H, W], of the last forward pass.
+        image, alpha: Of the last forward pass, float32 [H, W, channels] and [H, W].
         gradients: Of the last backward pass.
-        seconds: Wall time of each stage of the last passes.
-        intersections: Of splats and tiles.
+
+    Raises:
+        ValueError: Other numbers of coefficients or channels.
     """
 
-    def __init__(self, gaussians: Gaussians, camera: Camera, threads: int = 1) -> None:
+    def __init__(self, gaussians: Gaussians, camera: Camera, threads: int = 1, features: Tensor | None = None) -> None:
         n = len(gaussians)
-        if gaussians.sh.shape[1] != COEFFICIENTS:
-            raise ValueError(f"sh: expected [{n}, {COEFFICIENTS}, 3], got {list(gaussians.sh.shape)}")
+        values = gaussians.sh if features is None else features
+        fits = values.shape[1] in CHANNELS if features is not None else values.shape[1] == COEFFICIENTS
+        if not fits:
+            raise ValueError(f"expected sh [{n}, {COEFFICIENTS}, 3] or {CHANNELS} channels, got {list(values.shape)}")
         self._library = library("limit_training")
         self._library.workspace_new.restype = ctypes.c_void_p
         self._workspace = ctypes.c_void_p(self._library.workspace_new())
         weakref.finalize(self, self._library.workspace_delete, self._workspace)
-        self._inputs = [getattr(gaussians, field.name).numpy() for field in fields(Gradients)]
+        self._inputs = [*(getattr(gaussians, name).numpy() for name in PARAMETERS), values.numpy()]
         self._camera, self._threads = _camera(camera), threads
-        self.rgb, self.alpha = _aligned((*camera.size, 3)), _aligned(camera.size)
+        self._channels = 3 if features is None else values.shape[1]
+        self.image, self.alpha = _aligned((*camera.size, self._channels)), _aligned(camera.size)
         self.gradients = Gradients(*(_aligned(array.shape) for array in self._inputs))
-        self.seconds = np.zeros(len(STAGES))
-        self.intersections = 0
 
-    def forward(self) -> None:
-        f = np.float32
-        self.intersections = self._library.forward(
+    def forward(self) -> int:
+        """Render; returns how many splats touch how many tiles."""
+        return self._library.forward(
             self._workspace,
             ctypes.byref(self._camera),
             len(self._inputs[0]),
-            *(pointer(array, f, array.shape) for array in self._inputs),
+            *(pointer(array, np.float32, array.shape) for array in self._inputs),
+            self._channels,
             self._threads,
-            pointer(self.rgb, f, self.rgb.shape),
-            pointer(self.alpha, f, self.alpha.shape),
-            pointer(self.seconds, np.float64, (len(STAGES),)),
+            pointer(self.image, np.float32, self.image.shape),
+            pointer(self.alpha, np.float32, self.alpha.shape),
         )
 
-    def backward(self, v_rgb: np.ndarray, v_alpha: np.ndarray) -> None:
-        """Gradients of the loss with respect to the image, float32 [H, W, 3], and to alpha, [H, W]."""
-        f = np.float32
-        outputs = (getattr(self.gradients, field.name) for field in fields(Gradients))
+    def backward(self, v_image: np.ndarray, v_alpha: np.ndarray) -> None:
+        """Gradients of the loss with respect to the image, float32 [H, W, channels], and to alpha, [H, W]."""
         self._library.backward(
             self._workspace,
-            pointer(v_rgb, f, self.rgb.shape),
-            pointer(v_alpha, f, self.alpha.shape),
-            *(pointer(array, f, array.shape) for array in outputs),
-            pointer(self.seconds[FORWARD:], np.float64, (len(STAGES) - FORWARD,)),
+            pointer(v_image, np.float32, self.image.shape),
+            pointer(v_alpha, np.float32, self.alpha.shape),
+            self._channels,
+            *(pointer(array, np.float32, array.shape) for array in vars(self.gradients).values()),
         )
+
+    def seconds(self) -> dict[str, float]:
+        """Wall time of each stage of the last passes."""
+        times = np.zeros(len(STAGES))
+        self._library.stage_seconds(self._workspace, pointer(times, np.float64, times.shape))
+        return dict(zip(STAGES, times.tolist(), strict=True))
 
 
 def self_check(threads: int = 2) -> dict[str, float]:
@@ -138,42 +156,52 @@ def self_check(threads: int = 2) -> dict[str, float]:
 
     Returns:
         Largest absolute difference of image and alpha; largest difference of each gradient over its largest entry.
+        Each is the worst over colours and features.
 
     Raises:
         RuntimeError: One of them is not small.
     """
-    import torch
     from scenes import room, with_harmonics
-
-    from sgwarp.ops import reference
 
     gaussians, camera, _ = room(3000, seed=1)
     gaussians = with_harmonics(gaussians)
     camera = camera.resized(101, 150)
-    limit = TrainingLimit(gaussians, camera, threads)
-    limit.forward()
-    leaves = {field.name: getattr(gaussians, field.name).double().requires_grad_() for field in fields(Gradients)}
-    pose, size = camera.world_to_camera, (camera.width, camera.height)
-    geometry = [leaves[name] for name in ("means", "quats", "scales", "opacities")]
-    projection = reference.project(*geometry, pose, camera.K, *size, camera.near, camera.far)
-    colors = reference.spherical_harmonics(leaves["means"], leaves["sh"], pose)
-    raster = reference.composite(projection, colors, *size)
-    clear = (raster.margin > 1e-4) & (raster.order_margin > 2e-6)
+    errors: dict[str, float] = {}
+    for channels in (3, *CHANNELS):
+        for name, error in _differences(gaussians, camera, channels, threads).items():
+            errors[name] = max(errors.get(name, 0.0), error)
+    if max(errors["image"], errors["alpha"]) > 1e-4 or max(errors.values()) > 1e-3:
+        raise RuntimeError(f"limit_training.cpp differs from the oracle: {errors}")
+    return errors
+
+
+def _differences(gaussians: Gaussians, camera: Camera, channels: int, threads: int) -> dict[str, float]:
     generator = torch.Generator().manual_seed(0)
-    v_rgb, v_alpha = (torch.randn(*camera.size, c, generator=generator) * clear[..., None] for c in (3, 1))
-    (raster.features * v_rgb).sum().add((raster.alpha * v_alpha[..., 0]).sum()).backward()
-    limit.backward(v_rgb.numpy(), v_alpha[..., 0].numpy())
+    features = torch.randn(len(gaussians), channels, generator=generator) if channels > 3 else None
+    limit = TrainingLimit(gaussians, camera, threads, features)
+    limit.forward()
+    leaves = {name: getattr(gaussians, name).double().requires_grad_() for name in PARAMETERS}
+    leaves["values"] = (gaussians.sh if features is None else features).double().requires_grad_()
+    pose, size = camera.world_to_camera, (camera.width, camera.height)
+    geometry = [leaves[name] for name in PARAMETERS]
+    projection = reference.project(*geometry, pose, camera.K, *size, camera.near, camera.far)
+    seen = leaves["values"]
+    if features is None:
+        seen = reference.spherical_harmonics(leaves["means"], seen, pose)
+    raster = reference.composite(projection, seen, *size)
+    clear = (raster.margin > 1e-4) & (raster.order_margin > 2e-6)
+    v_image, v_alpha = (torch.randn(*camera.size, c, generator=generator) * clear[..., None] for c in (channels, 1))
+    torch.autograd.backward([raster.features, raster.alpha], [v_image.double(), v_alpha[..., 0].double()])
+    limit.backward(v_image.numpy(), v_alpha[..., 0].numpy())
     mask = clear.numpy()
     errors = {
-        "image": float(np.abs(limit.rgb - raster.features.detach().numpy())[mask].max()),
+        "image": float(np.abs(limit.image - raster.features.detach().numpy())[mask].max()),
         "alpha": float(np.abs(limit.alpha - raster.alpha.detach().numpy())[mask].max()),
     }
     for name, leaf in leaves.items():
         assert leaf.grad is not None
         expected = leaf.grad.numpy()
         errors[name] = float(np.abs(getattr(limit.gradients, name) - expected).max() / np.abs(expected).max())
-    if max(errors["image"], errors["alpha"]) > 1e-4 or max(errors.values()) > 1e-3:
-        raise RuntimeError(f"limit_training.cpp differs from the oracle: {errors}")
     return errors
 
 

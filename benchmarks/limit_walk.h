@@ -115,20 +115,20 @@ struct Recorded : Colors {
 // g = dL / d log alpha and d = pixel - centre, then the gradient of the three colours.
 constexpr int SUMS = 9;
 
-// Replay one tile from its last fragment to its first. T is the transmittance behind everything, `masks` ends with the
+// Replay one tile from its last fragment to its first. `kept` is the transmittance behind everything, `masks` ends with the
 // tile's; v_rgb [H, W, 3], v_alpha [H, W]; totals [splats, 16] belongs to this thread. With c a fragment's colour under
 // v_rgb and B the same of all behind it, dL / d log alpha = alpha T (c - B).
-inline void walk_back(const Scene &scene, int tile, Lanes *T, const uint16_t *rows, const Mask *masks,
+inline void walk_back(const Scene &scene, int tile, const Lanes *kept, const uint16_t *rows, const Mask *masks,
                       const float *v_rgb, const float *v_alpha, float *totals) {
   const int left = scene.left(tile), top = scene.top(tile), columns = std::min(TILE, scene.width - left);
-  Lanes behind[TILE], v[TILE][3];
+  Lanes T[TILE], behind[TILE], v[TILE][3];
   for (int r = 0; r < TILE && top + r < scene.height; r++) {
     const size_t pixel = (size_t)(top + r) * scene.width + left;
     float values[3 * TILE] = {}, opacity[TILE] = {};
     std::memcpy(values, v_rgb + 3 * pixel, sizeof(float) * 3 * columns);
     std::memcpy(opacity, v_alpha + pixel, sizeof(float) * columns);
     deinterleave<3>(values, v[r]);
-    behind[r] = -load(opacity);
+    behind[r] = -load(opacity), T[r] = kept[r];
   }
   const int first = scene.offsets[tile];
   for (int k = scene.offsets[tile + 1] - 1; k >= first; k--) {
