@@ -121,9 +121,7 @@ extern "C" double composite(int n, const float *mean2d, const float *conic, cons
 #pragma omp parallel for schedule(dynamic, 4) num_threads(threads)
   for (int tile = 0; tile < scene.tiles(); tile++) {
     Lanes T[TILE];
-    Colors colors;
-    walk(scene, tile, T, colors);
-    colors.write(scene, tile, T, rgb, alpha);
+    composite_colors(scene, tile, T, nullptr, rgb, alpha);
   }
   return omp_get_wtime() - start;
 }

@@ -10,47 +10,17 @@
 
 namespace {
 
-constexpr int BATCH = 32;
-
 // A fragment that a row takes something of: those pixels, its place in the batch. The end of a row is one more item,
 // with the number of items before it, so that the list can be read from its end.
 struct Item {
   uint16_t mask, fragment;
 };
 
-// Fragments as their tile sees them: the exponent at pixel (r, c) is (ramp + slopes[r]) dx + edges[r].
-struct Batch {
-  int count;
-  Lanes dx[BATCH], ramp[BATCH];
-  alignas(64) float edges[BATCH][16], slopes[BATCH][16];
-  alignas(64) uint16_t rows[BATCH];  // that it reaches
-  int32_t ids[BATCH];
-  float y0[BATCH];
-
-  void read(const Scene &scene, int tile, int first) {
-    const int left = scene.left(tile), top = scene.top(tile), columns = std::min(TILE, scene.width - left);
-    count = std::min(BATCH, scene.offsets[tile + 1] - first);
-    std::memset(rows, 0, sizeof rows);
-    for (int b = 0; b < count; b++) {
-      ids[b] = scene.ids[first + b];
-      const Splat &s = scene.splats[ids[b]];
-      const float x0 = left + 0.5f - s.x;
-      y0[b] = top + 0.5f - s.y;
-      const Lanes dy = IOTA + y0[b], edge = dy * dy * s.C + s.L, slope = dy * s.B;
-      const Lanes best = smaller(larger(dy * s.ridge, all(x0)), all(x0 + (columns - 1)));
-      rows[b] = greater_equal((best * s.A + slope) * best + edge, all(std::log2(ALPHA_MIN)));
-      dx[b] = IOTA + x0, ramp[b] = dx[b] * s.A;
-      store(edges[b], edge), store(slopes[b], slope);
-    }
-  }
-  Lanes exponent(int b, int row) const { return (ramp[b] + slopes[b][row]) * dx[b] + edges[b][row]; }
-};
-
 // Scratch of one thread.
 template <int S> struct FeatureScratch {
   Batch batch;
   Lanes image[TILE][16 * S];  // channels of the rows, or their gradients
-  Lanes weights[BATCH], values[BATCH + 4], moments[BATCH][3], gradients[BATCH][S];
+  Lanes weights[Batch::SIZE], values[Batch::SIZE + 4], moments[Batch::SIZE][3], gradients[Batch::SIZE][S];
 };
 
 // [pixel][channel] of a row of the image to [channel][pixel] and back; `columns` pixels lie inside.
@@ -79,9 +49,9 @@ int composite_features(const Scene &scene, int tile, const float *features, Feat
   for (int r = 0; r < TILE; r++) T[r] = all(1.0f), open[r] = r < rows ? (1u << columns) - 1 : 0;
   std::memset(scratch.image, 0, sizeof scratch.image);
   int batches = 0, open_rows = rows;
-  for (int first = scene.offsets[tile]; first < scene.offsets[tile + 1] && open_rows; first += BATCH, batches++) {
+  for (int first = scene.offsets[tile]; first < scene.offsets[tile + 1] && open_rows; first += Batch::SIZE, batches++) {
     batch.read(scene, tile, first);
-    if (used + TILE * (BATCH + 1) > items.size()) items.resize(2 * used + 65536);
+    if (used + TILE * (Batch::SIZE + 1) > items.size()) items.resize(2 * used + 65536);
     open_rows = 0;
     for (int r = 0; r < TILE; r++) {
       Item *item = &items[used];
@@ -104,7 +74,7 @@ int composite_features(const Scene &scene, int tile, const float *features, Feat
         Lanes sum[16], *kept = scratch.image[r] + 16 * s;
         for (int c = 0; c < 16; c++) sum[c] = kept[c];
         for (int i = 0; i < n; i++) {
-          const int gaussian = scene.splats[batch.ids[item[i].fragment]].gaussian;
+          const int gaussian = batch.splats[item[i].fragment]->gaussian;
           const float *x = features + (size_t)16 * S * gaussian + 16 * s;
           const Lanes weight = scratch.weights[i];
           for (int c = 0; c < 16; c++) sum[c] += weight * x[c];
@@ -139,10 +109,10 @@ void composite_features_back(const Scene &scene, int tile, int batches, const La
     read_row<S>(v_image + 16 * S * pixel, columns, scratch.image[r]);
   }
   const auto feature = [&](const Item &item) {
-    return features + (size_t)16 * S * scene.splats[batch.ids[item.fragment]].gaussian;
+    return features + (size_t)16 * S * batch.splats[item.fragment]->gaussian;
   };
   while (batches--) {
-    batch.read(scene, tile, scene.offsets[tile] + BATCH * batches);
+    batch.read(scene, tile, scene.offsets[tile] + Batch::SIZE * batches);
     std::memset(scratch.moments, 0, sizeof scratch.moments);
     std::memset(scratch.gradients, 0, sizeof scratch.gradients);
     uint32_t touched = 0;
@@ -186,7 +156,7 @@ void composite_features_back(const Scene &scene, int tile, int batches, const La
       const int b = __builtin_ctz(touched), id = batch.ids[b];
       const Lanes *g = scratch.moments[b], dx = batch.dx[b], gx = g[0] * dx;
       const Lanes parts[6] = {g[0], gx, g[1], gx * dx, g[1] * dx, g[2]};
-      float *total = totals + (size_t)16 * id, *to = v_features + (size_t)16 * S * scene.splats[id].gaussian;
+      float *total = totals + (size_t)16 * id, *to = v_features + (size_t)16 * S * batch.splats[b]->gaussian;
       store(total, load(total) + sums<6>(parts));
       while (locks[id].test_and_set(std::memory_order_acquire)) {}
       for (int s = 0; s < S; s++) store(to + 16 * s, load(to + 16 * s) + scratch.gradients[b][s]);

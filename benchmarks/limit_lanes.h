@@ -6,7 +6,7 @@
 #include <cstdint>
 #include <cstring>
 
-#ifdef __AVX512F__
+#ifdef __AVX512BW__
 #include <immintrin.h>
 #endif
 
@@ -29,7 +29,7 @@ inline Lanes load(const float *from) {
 }
 inline void store(float *to, Lanes value) { std::memcpy(to, &value, 64); }
 
-#ifdef __AVX512F__
+#ifdef __AVX512BW__
 inline Lanes load_if(bool wanted, const float *from) { return _mm512_maskz_loadu_ps(-(int)wanted, from); }
 inline Mask greater_equal(Lanes a, Lanes b, Mask where = 0xffff) {
   return _mm512_mask_cmp_ps_mask(where, a, b, _CMP_GE_OQ);
@@ -38,6 +38,17 @@ inline Mask greater(Lanes a, Lanes b, Mask where) { return _mm512_mask_cmp_ps_ma
 inline Mask equal(Ints a, int32_t b) { return _mm512_cmpeq_epi32_mask((__m512i)a, _mm512_set1_epi32(b)); }
 inline uint32_t having(const uint16_t *values, int bit) {  // which of 32 values, aligned to 64 bytes, have a bit set
   return _mm512_test_epi16_mask(_mm512_load_si512(values), _mm512_set1_epi16(1 << bit));
+}
+// Of 16 values: which are not zero; and those, appended: returns how many, writes up to 16.
+inline Mask nonzero(const uint16_t *values) {
+  const __m256i all = _mm256_load_si256((const __m256i *)values);
+  return _mm256_test_epi16_mask(all, all);
+}
+inline int compress(const uint16_t *values, uint16_t *to) {
+  const Mask mask = nonzero(values);
+  const __m512i wide = _mm512_cvtepu16_epi32(_mm256_load_si256((const __m256i *)values));
+  _mm256_storeu_si256((__m256i *)to, _mm512_cvtepi32_epi16(_mm512_maskz_compress_epi32(mask, wide)));
+  return __builtin_popcount(mask);
 }
 inline Lanes select(Mask mask, Lanes yes, Lanes no) { return _mm512_mask_blend_ps(mask, no, yes); }
 inline Lanes masked(Mask mask, Lanes value) { return _mm512_maskz_mov_ps(mask, value); }
@@ -84,6 +95,15 @@ inline uint32_t having(const uint16_t *values, int bit) {
   for (int i = 0; i < 32; i++) result |= (uint32_t)(values[i] >> bit & 1) << i;
   return result;
 }
+inline Mask nonzero(const uint16_t *values) {
+  return bits([&](int i) { return values[i] != 0; });
+}
+inline int compress(const uint16_t *values, uint16_t *to) {
+  int count = 0;
+  for (int i = 0; i < 16; i++)
+    if (values[i]) to[count++] = values[i];
+  return count;
+}
 inline Lanes select(Mask m, Lanes yes, Lanes no) { return lanes([&](int i) { return m >> i & 1 ? yes[i] : no[i]; }); }
 inline Lanes masked(Mask mask, Lanes value) { return select(mask, value, Lanes{}); }
 inline Lanes smaller(Lanes a, Lanes b) { return lanes([&](int i) { return a[i] < b[i] ? a[i] : b[i]; }); }
@@ -108,6 +128,7 @@ inline Lanes reciprocal(Lanes x) { return 1.0f / x; }
 inline void stream(float *to, Lanes value) { store(to, value); }
 #endif
 
+inline Lanes negative(Lanes x) { return (Lanes)((Ints)x | INT32_MIN); }  // -|x|
 inline Lanes clamp(Lanes x, float low, float high) { return smaller(larger(x, all(low)), all(high)); }
 
 // 2^x to 1.5e-7 relative: x is split at the integer below, the rest goes into the minimax polynomial of degree 5.

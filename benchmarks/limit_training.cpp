@@ -24,7 +24,7 @@ struct Workspace {
   DepthOrder depth;
   TileLists lists;
   Buffer<Tile> tiles;
-  Buffer<uint16_t> rows;                 // [I] see Recorded
+  Buffer<uint16_t> rows;                 // [I] see Record
   std::vector<std::vector<Mask>> masks;  // of every thread
   std::vector<std::vector<Item>> items;  // the same for features
   Buffer<std::atomic_flag> locks;        // [N]
@@ -72,14 +72,11 @@ struct Workspace {
 #pragma omp parallel num_threads(threads)
     {
       const int thread = omp_get_thread_num();
-      size_t used = 0;
+      Record record = {rows.data, masks[thread], 0};
 #pragma omp for schedule(dynamic, 4)
       for (int tile = 0; tile < view.tiles(); tile++) {
-        Recorded sink(view, tile, rows.data, masks[thread], used);
-        walk(view, tile, tiles[tile].T, sink);
-        sink.write(view, tile, tiles[tile].T, rgb, alpha);
-        tiles[tile].thread = thread;
-        tiles[tile].end = used = sink.used;
+        composite_colors(view, tile, tiles[tile].T, &record, rgb, alpha);
+        tiles[tile].thread = thread, tiles[tile].end = record.used;
       }
     }
   }

@@ -59,57 +59,99 @@ template <class Sink> void walk(const Scene &scene, int tile, Lanes *T, Sink &si
   }
 }
 
-// Three colours of a tile.
-struct Colors {
-  Lanes red[TILE], green[TILE], blue[TILE];
-  Colors() { std::memset(this, 0, sizeof *this); }
-  void row(int r, Mask, Lanes weight, const Splat &s) {
-    red[r] += weight * s.r;
-    green[r] += weight * s.g;
-    blue[r] += weight * s.b;
-  }
-  void next(int, const Splat &) {}
+// Which pixels take something of each fragment, for the backward pass.
+struct Record {
+  uint16_t *rows;            // [I] rows in which a pixel does
+  std::vector<Mask> &masks;  // those pixels, fragment by fragment, row by row
+  size_t used;               // masks
+};
 
-  // To row-major images [H, W, 3] and [H, W].
-  void write(const Scene &scene, int tile, const Lanes *T, float *rgb, float *alpha) const {
-    const int left = scene.left(tile), top = scene.top(tile);
-    const int columns = std::min(TILE, scene.width - left);
-    for (int r = 0; r < TILE && top + r < scene.height; r++) {
-      const size_t pixel = (size_t)(top + r) * scene.width + left;
-      const Lanes color[3] = {red[r], green[r], blue[r]}, opacity = 1.0f - T[r];
-      float values[3 * TILE];
-      interleave<3>(color, values);
-      std::memcpy(rgb + 3 * pixel, values, sizeof(float) * 3 * columns);
-      std::memcpy(alpha + pixel, &opacity, sizeof(float) * columns);
+// Fragments as their tile sees them: the exponent at pixel (r, c) is (ramp + slopes[r]) dx + edges[r].
+struct Batch {
+  static constexpr int SIZE = 32;
+  int count;
+  Lanes dx[SIZE], ramp[SIZE];
+  alignas(64) float edges[SIZE][16], slopes[SIZE][16];
+  alignas(64) uint16_t rows[SIZE];  // that it reaches
+  const Splat *splats[SIZE];
+  int32_t ids[SIZE];
+  float y0[SIZE];
+
+  void read(const Scene &scene, int tile, int first) {
+    const int left = scene.left(tile), top = scene.top(tile), columns = std::min(TILE, scene.width - left);
+    const int end = scene.offsets[tile + 1];
+    count = std::min(SIZE, end - first);
+    std::memset(rows, 0, sizeof rows);
+    for (int b = 0; b < count; b++) {
+      if (first + b + 8 < end) __builtin_prefetch(&scene.splats[scene.ids[first + b + 8]]);
+      ids[b] = scene.ids[first + b];
+      const Splat &s = scene.splats[ids[b]];
+      splats[b] = &s;
+      const float x0 = left + 0.5f - s.x;
+      y0[b] = top + 0.5f - s.y;
+      const Lanes dy = IOTA + y0[b], edge = dy * dy * s.C + s.L, slope = dy * s.B;
+      const Lanes best = smaller(larger(dy * s.ridge, all(x0)), all(x0 + (columns - 1)));
+      rows[b] = greater_equal((best * s.A + slope) * best + edge, all(std::log2(ALPHA_MIN)));
+      dx[b] = IOTA + x0, ramp[b] = dx[b] * s.A;
+      store(edges[b], edge), store(slopes[b], slope);
     }
   }
+  Lanes exponent(int b, int row) const { return (ramp[b] + slopes[b][row]) * dx[b] + edges[b][row]; }
 };
 
-// Colours for training: also which pixels take something of each fragment.
-struct Recorded : Colors {
-  uint16_t *rows;         // [I] rows of its tile in which a pixel takes something of each fragment
-  std::vector<Mask> &masks;  // those pixels, row by row
-  size_t used;
-  uint32_t kept = 0;
-  Recorded(const Scene &scene, int tile, uint16_t *rows, std::vector<Mask> &masks, size_t used)
-      : rows(rows), masks(masks), used(used) {
-    const int first = scene.offsets[tile];
-    std::memset(rows + first, 0, sizeof(uint16_t) * (scene.offsets[tile + 1] - first));
-    grow();
+// Three colours of one tile, a row of pixels at a time with its state in registers; to row-major images [H, W, 3] and
+// [H, W]. T receives the transmittance, `record` what the backward pass replays, unless it is null. Until then a pixel
+// that has closed keeps its transmittance with a negative sign: nothing can pass the test any more.
+inline void composite_colors(const Scene &scene, int tile, Lanes *T, Record *record, float *rgb, float *alpha) {
+  const int left = scene.left(tile), top = scene.top(tile);
+  const int columns = std::min(TILE, scene.width - left), rows = std::min(TILE, scene.height - top);
+  const int begin = scene.offsets[tile], end = scene.offsets[tile + 1];
+  const Lanes THRESHOLD = all(std::log2(ALPHA_MIN)), CLOSED = all(TRANSMITTANCE_MIN);
+  Lanes color[TILE][3] = {};
+  alignas(64) Mask taken[Batch::SIZE][TILE];
+  Batch batch;
+  for (int r = 0; r < rows; r++) T[r] = select((1u << columns) - 1, all(1.0f), all(-1.0f));
+  if (record) std::memset(record->rows + begin, 0, sizeof(uint16_t) * (end - begin));
+  uint32_t open = (1u << rows) - 1;
+  for (int first = begin; first < end && open; first += Batch::SIZE) {
+    batch.read(scene, tile, first);
+    std::memset(taken, 0, sizeof taken);
+    for (uint32_t left_over = open; left_over; left_over &= left_over - 1) {
+      const int r = __builtin_ctz(left_over);
+      Lanes t = T[r], red = color[r][0], green = color[r][1], blue = color[r][2];
+      for (uint32_t reaching = having(batch.rows, r); reaching; reaching &= reaching - 1) {
+        const int b = __builtin_ctz(reaching);
+        const Splat &s = *batch.splats[b];
+        const Lanes e = batch.exponent(b, r);
+        const Mask passed = greater_equal(e, THRESHOLD);
+        Lanes weight = smaller(exp2(e), all(ALPHA_MAX)) * t;
+        const Lanes next = t - weight;
+        const Mask counts = greater(next, CLOSED, passed);
+        weight = masked(counts, weight);
+        red += weight * s.r, green += weight * s.g, blue += weight * s.b;
+        t = select(counts, next, select(passed, negative(t), t));
+        taken[b][r] = counts;
+      }
+      T[r] = t, color[r][0] = red, color[r][1] = green, color[r][2] = blue;
+      if (!greater(t, Lanes{}, 0xffff)) open &= ~(1u << r);
+    }
+    if (!record) continue;
+    if (record->used + TILE * Batch::SIZE > record->masks.size()) record->masks.resize(2 * record->used + 65536);
+    for (int b = 0; b < batch.count; b++) {
+      record->rows[first + b] = nonzero(taken[b]);
+      record->used += compress(taken[b], &record->masks[record->used]);
+    }
   }
-  void grow() {
-    if (used + TILE > masks.size()) masks.resize(2 * used + 65536);
+  for (int r = 0; r < rows; r++) {
+    const size_t pixel = (size_t)(top + r) * scene.width + left;
+    T[r] = -negative(T[r]);
+    const Lanes opacity = 1.0f - T[r];
+    float values[3 * TILE];
+    interleave<3>(color[r], values);
+    std::memcpy(rgb + 3 * pixel, values, sizeof(float) * 3 * columns);
+    std::memcpy(alpha + pixel, &opacity, sizeof(float) * columns);
   }
-  void row(int r, Mask mask, Lanes weight, const Splat &s) {
-    Colors::row(r, mask, weight, s);
-    masks[used] = mask;
-    used += mask != 0, kept |= (mask != 0) << r;
-  }
-  void next(int k, const Splat &) {
-    rows[k] = kept, kept = 0;
-    grow();
-  }
-};
+}
 
 // Sums that the backward pass of compositing adds up for every splat: g d^i under 1, dx, dy, dx^2, dx dy, dy^2 with
 // g = dL / d log alpha and d = pixel - centre, then the gradient of the three colours.
