@@ -45,29 +45,29 @@ int composite_features(const Scene &scene, int tile, const float *features, Feat
   const int columns = std::min(TILE, scene.width - left), rows = std::min(TILE, scene.height - top);
   const Lanes THRESHOLD = all(std::log2(ALPHA_MIN)), CLOSED = all(TRANSMITTANCE_MIN);
   Batch &batch = scratch.batch;
-  Mask open[TILE];
-  for (int r = 0; r < TILE; r++) T[r] = all(1.0f), open[r] = r < rows ? (1u << columns) - 1 : 0;
+  for (int r = 0; r < rows; r++) T[r] = select((1u << columns) - 1, all(1.0f), all(-1.0f));
   std::memset(scratch.image, 0, sizeof scratch.image);
-  int batches = 0, open_rows = rows;
-  for (int first = scene.offsets[tile]; first < scene.offsets[tile + 1] && open_rows; first += Batch::SIZE, batches++) {
+  int batches = 0;
+  uint32_t open = (1u << rows) - 1;
+  for (int first = scene.offsets[tile]; first < scene.offsets[tile + 1] && open; first += Batch::SIZE, batches++) {
     batch.read(scene, tile, first);
     if (used + TILE * (Batch::SIZE + 1) > items.size()) items.resize(2 * used + 65536);
-    open_rows = 0;
-    for (int r = 0; r < TILE; r++) {
+    for (int r = 0; r < rows; r++) {
       Item *item = &items[used];
+      Lanes t = T[r];
       int n = 0;
-      for (uint32_t reaching = open[r] ? having(batch.rows, r) : 0; reaching; reaching &= reaching - 1) {
+      for (uint32_t reaching = open >> r & 1 ? having(batch.rows, r) : 0; reaching; reaching &= reaching - 1) {
         const int b = __builtin_ctz(reaching);
         const Lanes e = batch.exponent(b, r);
-        const Mask passed = greater_equal(e, THRESHOLD, open[r]);
-        const Lanes weight = smaller(exp2(e), all(ALPHA_MAX)) * T[r], next = T[r] - weight;
+        const Mask passed = greater_equal(e, THRESHOLD);
+        const Lanes weight = smaller(exp2(e), all(ALPHA_MAX)) * t, next = t - weight;
         const Mask counts = greater(next, CLOSED, passed);
         scratch.weights[n] = masked(counts, weight), item[n] = {counts, (uint16_t)b};
         n += counts != 0;
-        T[r] = select(counts, next, T[r]);
-        open[r] &= counts | ~passed;
+        t = select(counts, next, select(passed, negative(t), t));
       }
-      open_rows += open[r] != 0;
+      T[r] = t;
+      if (!greater(t, Lanes{}, 0xffff)) open &= ~(1u << r);
       item[n] = {(uint16_t)n, 0};
       used += n + 1;
       for (int s = 0; s < S; s++) {
@@ -85,6 +85,7 @@ int composite_features(const Scene &scene, int tile, const float *features, Feat
   }
   for (int r = 0; r < rows; r++) {
     const size_t pixel = (size_t)(top + r) * scene.width + left;
+    T[r] = -negative(T[r]);
     const Lanes opacity = 1.0f - T[r];
     write_row<S>(scratch.image[r], columns, image + 16 * S * pixel);
     std::memcpy(alpha + pixel, &opacity, sizeof(float) * columns);
@@ -116,7 +117,7 @@ void composite_features_back(const Scene &scene, int tile, int batches, const La
     std::memset(scratch.moments, 0, sizeof scratch.moments);
     std::memset(scratch.gradients, 0, sizeof scratch.gradients);
     uint32_t touched = 0;
-    for (int r = TILE - 1; r >= 0; r--) {
+    for (int r = rows - 1; r >= 0; r--) {
       const int n = (--items)->mask;
       items -= n;
       for (int i = 0; i < n; i += 4) {  // features under the image's gradient, four fragments at a time
