@@ -37,6 +37,12 @@ template <int S> inline void write_row(Lanes *from, int columns, float *to) {
   }
 }
 
+// The features of a batch are fetched while its first weights are computed.
+template <int S> inline void prefetch_features(const Batch &batch, const float *features) {
+  for (int b = 0; b < batch.count; b++)
+    for (int s = 0; s < S; s++) __builtin_prefetch(features + 16 * ((size_t)S * batch.splats[b]->gaussian + s));
+}
+
 // Returns how many batches were looked at; T receives the transmittance, `items` what the backward pass replays.
 template <int S>
 int composite_features(const Scene &scene, int tile, const float *features, FeatureScratch<S> &scratch, Lanes *T,
@@ -51,6 +57,7 @@ int composite_features(const Scene &scene, int tile, const float *features, Feat
   uint32_t open = (1u << rows) - 1;
   for (int first = scene.offsets[tile]; first < scene.offsets[tile + 1] && open; first += Batch::SIZE, batches++) {
     batch.read(scene, tile, first);
+    prefetch_features<S>(batch, features);
     if (used + TILE * (Batch::SIZE + 1) > items.size()) items.resize(2 * used + 65536);
     for (int r = 0; r < rows; r++) {
       Item *item = &items[used];
@@ -114,6 +121,7 @@ void composite_features_back(const Scene &scene, int tile, int batches, const La
   };
   while (batches--) {
     batch.read(scene, tile, scene.offsets[tile] + Batch::SIZE * batches);
+    prefetch_features<S>(batch, features);
     std::memset(scratch.moments, 0, sizeof scratch.moments);
     std::memset(scratch.gradients, 0, sizeof scratch.gradients);
     uint32_t touched = 0;
@@ -146,9 +154,15 @@ void composite_features_back(const Scene &scene, int tile, int batches, const La
         Lanes sum[S], *gradient = scratch.gradients[items[i].fragment];
         const float *weights = (const float *)&scratch.weights[i];
         for (int s = 0; s < S; s++) sum[s] = gradient[s];
-        for (uint32_t left_over = items[i].mask; left_over; left_over &= left_over - 1) {
-          const int p = __builtin_ctz(left_over);
-          for (int s = 0; s < S; s++) sum[s] += weights[p] * load(pixels + 16 * (S * p + s));
+        if (S == 1 && columns == TILE) {  // one vector a pixel: all of them are faster than finding out which
+          Lanes parts[4] = {sum[0]};
+          for (int p = 0; p < TILE; p++) parts[p % 4] += weights[p] * load(pixels + 16 * p);
+          sum[0] = (parts[0] + parts[1]) + (parts[2] + parts[3]);
+        } else {
+          for (uint32_t left_over = items[i].mask; left_over; left_over &= left_over - 1) {
+            const int p = __builtin_ctz(left_over);
+            for (int s = 0; s < S; s++) sum[s] += weights[p] * load(pixels + 16 * (S * p + s));
+          }
         }
         for (int s = 0; s < S; s++) gradient[s] = sum[s];
       }

@@ -28,6 +28,7 @@ struct Workspace {
   std::vector<std::vector<Mask>> masks;  // of every thread
   std::vector<std::vector<Item>> items;  // the same for features
   Buffer<std::atomic_flag> locks;        // [N]
+  Buffer<FeatureScratch<4>> scratch;     // of every thread; with fewer slices its front is used
   Buffer<float> totals;    // [threads, N, 16]
   double seconds[9], clock;
 
@@ -84,16 +85,16 @@ struct Workspace {
   template <int S> void composite_channels(const float *features, float *image, float *alpha) {
     const Scene view = scene();
     tiles.reserve(view.tiles());
-    items.resize(threads);
+    items.resize(threads), scratch.reserve(threads);
 #pragma omp parallel num_threads(threads)
     {
-      static thread_local FeatureScratch<S> scratch;
       const int thread = omp_get_thread_num();
+      auto &mine = (FeatureScratch<S> &)scratch[thread];
       size_t used = 0;
 #pragma omp for schedule(dynamic, 4)
       for (int tile = 0; tile < view.tiles(); tile++) {
         Tile &t = tiles[tile];
-        t.batches = composite_features<S>(view, tile, features, scratch, t.T, items[thread], used, image, alpha);
+        t.batches = composite_features<S>(view, tile, features, mine, t.T, items[thread], used, image, alpha);
         t.thread = thread, t.end = used;
       }
     }
@@ -113,8 +114,8 @@ struct Workspace {
     totals.reserve((size_t)16 * gaussians.count * threads), locks.reserve(gaussians.count);
 #pragma omp parallel num_threads(threads)
     {
-      static thread_local FeatureScratch<S> scratch;
-      float *mine = fresh_totals();
+      auto &mine = (FeatureScratch<S> &)scratch[omp_get_thread_num()];
+      float *sums = fresh_totals();
 #pragma omp for schedule(static)
       for (int c = 0; c < chunks(); c++) {
         const size_t first = (size_t)16 * S * CHUNK * c, last = (size_t)16 * S * std::min(CHUNK * (c + 1), gaussians.count);
@@ -124,7 +125,7 @@ struct Workspace {
       for (int tile = 0; tile < view.tiles(); tile++) {
         const Tile &t = tiles[tile];
         composite_features_back<S>(view, tile, t.batches, t.T, items[t.thread].data() + t.end, features, v_image,
-                                   v_alpha, scratch, mine, v_features, locks.data);
+                                   v_alpha, mine, sums, v_features, locks.data);
       }
     }
   }
