@@ -35,14 +35,20 @@ def measure(cores: int, rounds: int, counts: tuple[int, ...] = COUNTS) -> dict[s
     times = {count: at(count, cores, rounds) for count in counts}
     print(f"\nGrowth from {counts[0]} to {counts[-1]} Gaussians, {plural(cores)}, times [ms]")
     exponents: dict[str, float] = {}
+    late: dict[str, float] = {}  # of the last decade: what is constant weighs less
     for kind in ("whole", "stages"):
         for name in times[counts[0]][kind]:
             if name == "whole":
                 continue
             column = [times[count][kind][name] for count in counts]
-            exponents[name] = exponent(counts, column)
-            report(name + "  " + " ".join(f"{value:.1f}" for value in column) + ", exponent", exponents[name])
-    return {"times": {str(count): value for count, value in times.items()}, "exponents": exponents}
+            exponents[name], late[name] = exponent(counts, column), exponent(counts[-3:], column[-3:])
+            values = " ".join(f"{value:.1f}" for value in column)
+            report(f"{name}  {values}, exponent", exponents[name], f"last {late[name]:.2f}")
+    return {
+        "times": {str(count): value for count, value in times.items()},
+        "exponents": exponents,
+        f"exponents from {counts[-3]}": late,
+    }
 
 
 def draw(results: dict[str, Any], path: Path) -> None:

@@ -152,7 +152,7 @@ void composite_features_back(const Scene &scene, int tile, int batches, const La
       const float *pixels = v_image + 16 * S * ((size_t)(top + r) * scene.width + left);
       for (int i = 0; i < n; i++) {
         Lanes sum[S], *gradient = scratch.gradients[items[i].fragment];
-        const float *weights = (const float *)&scratch.weights[i];
+        const Lanes &weights = scratch.weights[i];
         for (int s = 0; s < S; s++) sum[s] = gradient[s];
         if (S == 1 && columns == TILE) {  // one vector a pixel: all of them are faster than finding out which
           Lanes parts[4] = {sum[0]};

@@ -94,13 +94,14 @@ struct DepthOrder {
 
 // Which splats each tile composites, front to back: exactly those that reach one of its pixel centres' rectangle.
 struct TileLists {
-  struct Span { uint16_t first, last; };  // tile columns of a splat within a row of tiles
-  std::vector<int32_t> cursors;           // [slices, tiles]
-  std::vector<std::vector<Span>> spans;   // of every slice, splat by splat
+  // Tile columns of a splat within a row of tiles; before them, the rows of the splat.
+  struct Span { uint16_t first, last; };
+  std::vector<int32_t> cursors;          // [slices, tiles]
+  std::vector<std::vector<Span>> spans;  // of every slice, splat by splat
   Buffer<int32_t> offsets, ids;
 
-  // Spans of tile columns per tile row; ends after the last one.
-  static Span *spans_of(const Splat &s, int width, int height, Span *out) {
+  // The rows of a splat and its spans; returns how many rows there are.
+  static int spans_of(const Splat &s, int width, int height, Span *out) {
     const int top = std::max((int)std::ceil(s.y - s.half_height - 0.5f), 0);
     const int bottom = std::min((int)std::floor(s.y + s.half_height - 0.5f), height - 1);
     const int box_first = std::max((int)std::ceil(s.x - s.half_width - 0.5f), 0);
@@ -110,7 +111,9 @@ struct TileLists {
     const float q = s.L - std::log2(ALPHA_MIN) + SLACK, inverse = -0.5f / s.A;
     const float D = -4.0f * s.A * q, E = 4.0f * s.A * s.C - s.B * s.B;
     const float summit = -0.5f * s.B * s.half_width / s.C;  // dy at which the footprint reaches furthest to the right
-    for (int row = top / TILE; row * TILE <= bottom; row++) {
+    const int rows = top <= bottom ? bottom / TILE - top / TILE + 1 : 0;
+    *out++ = {(uint16_t)(top / TILE), (uint16_t)rows};
+    for (int row = top / TILE; row < top / TILE + rows; row++) {
       int first = box_first, last = box_last;
       if (!narrow) {
         const float low = std::max(row * TILE + 0.5f - s.y, -s.half_height);
@@ -123,7 +126,7 @@ struct TileLists {
       }
       *out++ = first <= last ? Span{(uint16_t)(first / TILE), (uint16_t)(last / TILE)} : Span{1, 0};
     }
-    return out;
+    return rows;
   }
 
   int build(const Splat *splats, const int32_t *order, int count, int width, int height, int threads) {
@@ -141,12 +144,15 @@ struct TileLists {
       size_t used = 0;
       for (int k = begin(slice); k < begin(slice + 1); k++) {
         if (k + 12 < count) __builtin_prefetch(&splats[order[k + 12]]);
-        if (mine.size() < used + down) mine.resize(2 * used + 16 * down);
-        const Splat &s = splats[order[k]];
-        const Span *end = spans_of(s, width, height, &mine[used]);
-        int32_t *row = counts + first_row(s) * columns;
-        for (; &mine[used] < end; used++, row += columns)
-          for (int column = mine[used].first; column <= mine[used].last; column++) row[column]++;
+        if (mine.size() < used + down + 1) mine.resize(2 * used + 16 * down);
+        const int rows = spans_of(splats[order[k]], width, height, &mine[used]);
+        const Span *span = &mine[used];
+        int32_t *row = counts + span->first * columns;
+        for (int r = 0; r < rows; r++, row += columns) {
+          span++;
+          for (int column = span->first; column <= span->last; column++) row[column]++;
+        }
+        used += rows + 1;
       }
     }
     int total = 0;
@@ -165,18 +171,14 @@ struct TileLists {
       int32_t *places = &cursors[(size_t)slice * tiles];
       const Span *span = spans[slice].data();
       for (int k = begin(slice); k < begin(slice + 1); k++) {
-        if (k + 12 < count) __builtin_prefetch(&splats[order[k + 12]]);
-        const Splat &s = splats[order[k]];
-        const int bottom = std::min((int)std::floor(s.y + s.half_height - 0.5f), height - 1);
-        for (int row = first_row(s); row * TILE <= bottom; row++, span++)
-          for (int column = span->first; column <= span->last; column++)
-            ids[places[row * columns + column]++] = order[k];
+        const int rows = span->last;
+        int32_t *row = places + span++->first * columns;
+        for (int r = 0; r < rows; r++, row += columns, span++)
+          for (int column = span->first; column <= span->last; column++) ids[row[column]++] = order[k];
       }
     }
     return total;
   }
-
-  static int first_row(const Splat &s) { return std::max((int)std::ceil(s.y - s.half_height - 0.5f), 0) / TILE; }
 };
 
 }  // namespace

@@ -141,7 +141,7 @@ inline Mask project_group(const Gaussians &g, const Camera &c, int first, Splat 
   row[2] = -0.5f * sharp * s.yy, row[3] = sharp * s.xy, row[4] = -0.5f * sharp * s.xx, row[5] = level;
   row[6] = s.xy / s.yy;
   row[10] = half_width, row[11] = half_height, row[12] = s.point[2];
-  for (int i = 0; i < 16; i++) ((int32_t *)&row[13])[i] = first + i;
+  row[13] = (Lanes)(__builtin_convertvector(IOTA, Ints) + first);
   transpose(row);
   for (uint32_t left = visible; left; left &= left - 1) store((float *)out++, row[__builtin_ctz(left)]);
   return visible;
