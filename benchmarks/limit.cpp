@@ -4,7 +4,7 @@
 
 #include <omp.h>
 
-#include "limit_walk.h"
+#include "limit_colors.h"
 
 namespace {
 
@@ -23,6 +23,44 @@ const Splat *splats_of(int n, const float *mean2d, const float *conic, const flo
     if (color) s.r = color[3 * i], s.g = color[3 * i + 1], s.b = color[3 * i + 2];
   }
   return splats.data();
+}
+
+// Walk one tile front to back; T receives the transmittance. sink.row(row, mask, weights, splat) gets alpha T of the
+// pixels in mask, for every row a Gaussian reaches; sink.next(k, splat) follows the last row of fragment k.
+template <class Sink> void walk(const Scene &scene, int tile, Lanes *T, Sink &sink) {
+  const int left = scene.left(tile), top = scene.top(tile);
+  const int columns = std::min(TILE, scene.width - left), rows = std::min(TILE, scene.height - top);
+  const Lanes THRESHOLD = all(std::log2(ALPHA_MIN)), CLOSED = all(TRANSMITTANCE_MIN);
+  Mask open[TILE];  // pixels of each row that have not closed
+  for (int r = 0; r < TILE; r++) T[r] = all(1.0f), open[r] = (1u << columns) - 1;
+  uint32_t open_rows = (1u << rows) - 1;
+  const int end = scene.offsets[tile + 1];
+  for (int k = scene.offsets[tile]; k < end && open_rows; k++) {
+    if (k + 6 < end) __builtin_prefetch(&scene.splats[scene.ids[k + 6]]);
+    const Splat &s = scene.splats[scene.ids[k]];
+    const float x0 = left + 0.5f - s.x, y0 = top + 0.5f - s.y;
+    const Lanes dy = IOTA + y0, edge = dy * dy * s.C + s.L, slope = dy * s.B;
+    const Lanes best = smaller(larger(dy * s.ridge, all(x0)), all(x0 + (columns - 1)));
+    const uint32_t reached = greater_equal((best * s.A + slope) * best + edge, THRESHOLD) & open_rows;
+    if (!reached) continue;
+    const Lanes dx = IOTA + x0, ramp = dx * s.A;
+    alignas(64) float edges[16], slopes[16];
+    store(edges, edge), store(slopes, slope);
+    for (uint32_t left_over = reached; left_over; left_over &= left_over - 1) {
+      const int r = __builtin_ctz(left_over);
+      const Lanes e = (ramp + slopes[r]) * dx + edges[r];
+      const Mask passed = greater_equal(e, THRESHOLD, open[r]);
+      const Lanes weight = smaller(exp2(e), all(ALPHA_MAX)) * T[r], next = T[r] - weight;
+      const Mask counts = greater(next, CLOSED, passed);
+      sink.row(r, counts, masked(counts, weight), s);
+      T[r] = select(counts, next, T[r]);
+      if (passed != counts) {
+        open[r] &= counts | ~passed;
+        if (!open[r]) open_rows &= ~(1u << r);
+      }
+    }
+    sink.next(k, s);
+  }
 }
 
 // Sums weights under each id of a tile: one accumulator of 16 lanes per id present, reduced once per Gaussian.

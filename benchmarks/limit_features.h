@@ -1,12 +1,12 @@
 // Compositing of feature vectors by hand, forward and backward: S slices of 16 channels.
 //
-// Fragments come in batches. For a row of 16 pixels, the weights of a batch are computed first; then they are multiplied
-// by the features as small matrices are, 16 channels by 16 pixels in registers.
+// Fragments come in batches. For a row of 16 pixels, the weights of a batch are computed first; then they are
+// multiplied by the features as small matrices are, 16 channels by 16 pixels in registers.
 #pragma once
 
 #include <atomic>
 
-#include "limit_walk.h"
+#include "limit_colors.h"
 
 namespace {
 

@@ -57,7 +57,19 @@ template <int K> inline void store_group(const Lanes *from, Mask where, int firs
   std::memcpy(to + (size_t)K * first, padded, sizeof(float) * K * (count - first));
 }
 
-// 16 Gaussians seen by a camera.
+// 16 Gaussians.
+struct Parameters {
+  Lanes mean[3], quat[4], scale[3], opacity;
+
+  Parameters(const Gaussians &g, int first) {
+    load_group<3>(g.means, first, g.count, mean);
+    load_group<4>(g.quats, first, g.count, quat);
+    load_group<3>(g.scales, first, g.count, scale);
+    load_group<1>(g.opacities, first, g.count, &opacity);
+  }
+};
+
+// The same seen by a camera.
 struct Shape {
   Lanes point[3], inv_z, x, y, tx, ty;  // in the camera; over z; the same within the Jacobian's bounds
   Lanes row_x[2], row_y[2];             // of the Jacobian: entries (0, 2) and (1, 2)
@@ -67,7 +79,8 @@ struct Shape {
   Lanes m_x[3], m_y[3];                 // and of the Gaussian's: the covariance is their product
   Lanes xx, xy, yy, determinant;
 
-  Shape(const Camera &c, const Lanes *mean, const Lanes *quat, const Lanes *scale) {
+  Shape(const Camera &c, const Parameters &g) {
+    const Lanes *mean = g.mean, *quat = g.quat, *scale = g.scale;
     Lanes away[3], turn[9];
     for (int j = 0; j < 3; j++) away[j] = mean[j] - c.center[j];
     const float *R = c.rotation;
@@ -113,23 +126,21 @@ inline Lanes magnitude(const Lanes *v, int count) {
 
 // Splats of the visible among 16 Gaussians go to `out`, without gaps; returns which they are.
 inline Mask project_group(const Gaussians &g, const Camera &c, int first, Splat *out) {
-  Lanes mean[3], quat[4], scale[3], opacity[1];
-  load_group<3>(g.means, first, g.count, mean);
-  load_group<4>(g.quats, first, g.count, quat);
-  load_group<3>(g.scales, first, g.count, scale);
-  load_group<1>(g.opacities, first, g.count, opacity);
-  const Shape s(c, mean, quat, scale);
-  const Lanes everything = magnitude(mean, 3) + magnitude(quat, 4) + magnitude(scale, 3) + magnitude(opacity, 1);
+  const Parameters p(g, first);
+  const Shape s(c, p);
+  const Lanes everything =
+      magnitude(p.mean, 3) + magnitude(p.quat, 4) + magnitude(p.scale, 3) + magnitude(&p.opacity, 1);
   // By bits: -ffast-math takes every number for finite.
-  const Mask broken = equal((Ints)everything & 0x7f800000, 0x7f800000) | equal((Ints)s.determinant & 0x7f800000, 0x7f800000);
-  const Lanes length2 = quat[0] * quat[0] + quat[1] * quat[1] + quat[2] * quat[2] + quat[3] * quat[3];
-  Mask visible = greater_equal(opacity[0], all(ALPHA_MIN)) & greater_equal(length2, all(1e-6f)) & ~broken;
+  const int32_t EXPONENT = 0x7f800000;
+  const Mask broken = equal((Ints)everything & EXPONENT, EXPONENT) | equal((Ints)s.determinant & EXPONENT, EXPONENT);
+  const Lanes length2 = p.quat[0] * p.quat[0] + p.quat[1] * p.quat[1] + p.quat[2] * p.quat[2] + p.quat[3] * p.quat[3];
+  Mask visible = greater_equal(p.opacity, all(ALPHA_MIN)) & greater_equal(length2, all(1e-6f)) & ~broken;
   visible = greater(s.point[2], all(c.near), visible) & greater(all(c.far), s.point[2], visible);
   visible = greater(s.determinant, Lanes{}, visible);
 
   Lanes row[16] = {};
   const Lanes x = c.focal[0] * s.x + c.principal[0], y = c.focal[1] * s.y + c.principal[1];
-  const Lanes level = log2(larger(opacity[0], all(ALPHA_MIN)));
+  const Lanes level = log2(larger(p.opacity, all(ALPHA_MIN)));
   const Lanes reach = (level + (SLACK - std::log2(ALPHA_MIN))) * (2.0f / LOG2E);
   const Lanes half_width = root(reach * s.xx), half_height = root(reach * s.yy);
   visible &= greater_equal(x + half_width, all(0.5f)) & greater_equal(all(c.width - 0.5f), x - half_width);
@@ -150,12 +161,8 @@ inline Mask project_group(const Gaussians &g, const Camera &c, int first, Splat 
 // From the sums of g d^i, d = pixel - centre, under 1, dx, dy, dx^2, dx dy, dy^2, to the gradients of 16 Gaussians.
 inline void project_group_backward(const Gaussians &g, const Camera &c, int first, Mask visible, const Lanes *sum,
                                    float *v_means, float *v_quats, float *v_scales, float *v_opacities) {
-  Lanes mean[3], quat[4], scale[3], opacity[1];
-  load_group<3>(g.means, first, g.count, mean);
-  load_group<4>(g.quats, first, g.count, quat);
-  load_group<3>(g.scales, first, g.count, scale);
-  load_group<1>(g.opacities, first, g.count, opacity);
-  const Shape s(c, mean, quat, scale);
+  const Parameters p(g, first);
+  const Shape s(c, p);
   const Lanes inverse = 1.0f / s.determinant;
   const Lanes qa = s.yy * inverse, qb = -s.xy * inverse, qc = s.xx * inverse;  // Q, the conic
   const Lanes v_x = qa * sum[1] + qb * sum[2], v_y = qb * sum[1] + qc * sum[2];
@@ -166,7 +173,7 @@ inline void project_group_backward(const Gaussians &g, const Camera &c, int firs
     const Lanes d_x = sum[3] * n_x + sum[4] * n_y, d_y = sum[4] * n_x + sum[5] * n_y;
     const Lanes m_x = qa * d_x + qb * d_y, m_y = qb * d_x + qc * d_y;
     v_scale[j] = m_x * s.along_x[j] + m_y * s.along_y[j];
-    v_along_x[j] = m_x * scale[j], v_along_y[j] = m_y * scale[j];
+    v_along_x[j] = m_x * p.scale[j], v_along_y[j] = m_y * p.scale[j];
   }
   // The Jacobian's rows are fx (1, 0, -tx) / z and fy (0, 1, -ty) / z; where clamped, it does not depend on x/z, y/z.
   Lanes row_x[3], row_y[3], v_axes[9], v_turn[9], v_point[3], v_mean[3], v_quat[4];
@@ -201,7 +208,7 @@ inline void project_group_backward(const Gaussians &g, const Camera &c, int firs
   v_quat[3] = 2.0f * (w * xy + x * s_xz + y * s_yz - 2.0f * z * (v[0] + v[4]));
   const Lanes radial = w * v_quat[0] + x * v_quat[1] + y * v_quat[2] + z * v_quat[3];
   for (int j = 0; j < 4; j++) v_quat[j] = (v_quat[j] - s.unit[j] * radial) * s.inv_length;
-  const Lanes v_opacity = sum[0] / opacity[0];
+  const Lanes v_opacity = sum[0] / p.opacity;
   store_group<3>(v_mean, visible, first, g.count, v_means);
   store_group<4>(v_quat, visible, first, g.count, v_quats);
   store_group<3>(v_scale, visible, first, g.count, v_scales);

@@ -1,8 +1,8 @@
 // The limit of a training step: Gaussians to image and back by hand, everything kept in memory that is used again.
+#include "limit_colors.h"
 #include "limit_features.h"
 #include "limit_harmonics.h"
 #include "limit_lists.h"
-#include "limit_walk.h"
 
 namespace {
 
@@ -61,8 +61,8 @@ struct Workspace {
 
   void shade() {
 #pragma omp parallel for num_threads(threads) schedule(static)
-    for (int group = 0; group < group_count(); group++)
-      if (groups[group].visible) shade_group(gaussians, camera, 16 * group, groups[group], &splats[groups[group].first]);
+    for (int i = 0; i < group_count(); i++)
+      if (groups[i].visible) shade_group(gaussians, camera, 16 * i, groups[i], &splats[groups[i].first]);
   }
 
   void composite(float *rgb, float *alpha) {
@@ -118,8 +118,8 @@ struct Workspace {
       float *sums = fresh_totals();
 #pragma omp for schedule(static)
       for (int c = 0; c < chunks(); c++) {
-        const size_t first = (size_t)16 * S * CHUNK * c, last = (size_t)16 * S * std::min(CHUNK * (c + 1), gaussians.count);
-        std::memset(v_features + first, 0, sizeof(float) * (last - first));
+        const int first = CHUNK * c, last = std::min(first + CHUNK, gaussians.count);
+        std::memset(v_features + (size_t)16 * S * first, 0, sizeof(float) * 16 * S * (last - first));
       }
 #pragma omp for schedule(dynamic, 4)
       for (int tile = 0; tile < view.tiles(); tile++) {
@@ -191,7 +191,7 @@ extern "C" Workspace *workspace_new() { return new Workspace(); }
 extern "C" void workspace_delete(Workspace *workspace) { delete workspace; }
 
 // values [N, 16, 3] are coefficients where channels is 3, else features [N, channels], channels 16 or 64. image [H, W,
-// channels], alpha [H, W]. The arrays stay where they are until the backward pass. Returns how many intersections there are.
+// channels], alpha [H, W]. The arrays stay where they are until the backward pass. Returns the number of intersections.
 extern "C" int forward(Workspace *w, const Camera *camera, int count, const float *means, const float *quats,
                        const float *scales, const float *opacities, const float *values, int channels, int threads,
                        float *image, float *alpha) {
@@ -203,8 +203,8 @@ extern "C" int forward(Workspace *w, const Camera *camera, int count, const floa
   w->depth.sort(w->splats.data, w->held.data, w->starts.data, w->chunks(), threads), w->lap(1);
   if (channels == 3) w->shade();
   w->lap(2);
-  const int visible = w->starts[w->chunks()];
-  const int total = w->lists.build(w->splats.data, w->depth.order.data, visible, camera->width, camera->height, threads);
+  const int visible = w->starts[w->chunks()], width = camera->width, height = camera->height;
+  const int total = w->lists.build(w->splats.data, w->depth.order.data, visible, width, height, threads);
   w->lap(3);
   if (channels == 3) w->composite(image, alpha);
   if (channels == 16) w->composite_channels<1>(values, image, alpha);
@@ -230,4 +230,6 @@ extern "C" void backward(Workspace *w, const float *v_image, const float *v_alph
 }
 
 // Wall times of the last passes' nine stages.
-extern "C" void stage_seconds(const Workspace *w, double *seconds) { std::memcpy(seconds, w->seconds, sizeof w->seconds); }
+extern "C" void stage_seconds(const Workspace *w, double *seconds) {
+  std::memcpy(seconds, w->seconds, sizeof w->seconds);
+}

@@ -1,7 +1,8 @@
-// Compositing of tile lists by hand, forward and backward: 16 pixels of a row at a time.
+// Compositing of three colours by hand, forward and backward: 16 pixels of a row at a time, a thread per 16 x 16 tile.
 //
-// A thread owns a 16 x 16 tile. Its list of Gaussians comes front to back. For each of them one vector operation over
-// the 16 rows finds the rows it reaches; those rows are composited 16 pixels at a time, their state being in L1.
+// Forward, fragments come in batches: one vector operation over the 16 rows of the tile finds the rows that a fragment
+// reaches; then each row takes its fragments of the batch one after the other, its state in registers. Backward,
+// fragments come one at a time, from the last, so that their sums over the rows are in registers.
 #pragma once
 
 #include <vector>
@@ -20,44 +21,6 @@ struct Scene {
   int left(int tile) const { return tile % across() * TILE; }
   int top(int tile) const { return tile / across() * TILE; }
 };
-
-// Walk one tile front to back; T receives the transmittance. sink.row(row, mask, weights, splat) gets alpha T of the
-// pixels in mask, for every row a Gaussian reaches; sink.next(k, splat) follows the last row of fragment k.
-template <class Sink> void walk(const Scene &scene, int tile, Lanes *T, Sink &sink) {
-  const int left = scene.left(tile), top = scene.top(tile);
-  const int columns = std::min(TILE, scene.width - left), rows = std::min(TILE, scene.height - top);
-  const Lanes THRESHOLD = all(std::log2(ALPHA_MIN)), CLOSED = all(TRANSMITTANCE_MIN);
-  Mask open[TILE];  // pixels of each row that have not closed
-  for (int r = 0; r < TILE; r++) T[r] = all(1.0f), open[r] = (1u << columns) - 1;
-  uint32_t open_rows = (1u << rows) - 1;
-  const int end = scene.offsets[tile + 1];
-  for (int k = scene.offsets[tile]; k < end && open_rows; k++) {
-    if (k + 6 < end) __builtin_prefetch(&scene.splats[scene.ids[k + 6]]);
-    const Splat &s = scene.splats[scene.ids[k]];
-    const float x0 = left + 0.5f - s.x, y0 = top + 0.5f - s.y;
-    const Lanes dy = IOTA + y0, edge = dy * dy * s.C + s.L, slope = dy * s.B;
-    const Lanes best = smaller(larger(dy * s.ridge, all(x0)), all(x0 + (columns - 1)));
-    const uint32_t reached = greater_equal((best * s.A + slope) * best + edge, THRESHOLD) & open_rows;
-    if (!reached) continue;
-    const Lanes dx = IOTA + x0, ramp = dx * s.A;
-    alignas(64) float edges[16], slopes[16];
-    store(edges, edge), store(slopes, slope);
-    for (uint32_t left_over = reached; left_over; left_over &= left_over - 1) {
-      const int r = __builtin_ctz(left_over);
-      const Lanes e = (ramp + slopes[r]) * dx + edges[r];
-      const Mask passed = greater_equal(e, THRESHOLD, open[r]);
-      const Lanes weight = smaller(exp2(e), all(ALPHA_MAX)) * T[r], next = T[r] - weight;
-      const Mask counts = greater(next, CLOSED, passed);
-      sink.row(r, counts, masked(counts, weight), s);
-      T[r] = select(counts, next, T[r]);
-      if (passed != counts) {
-        open[r] &= counts | ~passed;
-        if (!open[r]) open_rows &= ~(1u << r);
-      }
-    }
-    sink.next(k, s);
-  }
-}
 
 // Which pixels take something of each fragment, for the backward pass.
 struct Record {
@@ -157,9 +120,9 @@ inline void composite_colors(const Scene &scene, int tile, Lanes *T, Record *rec
 // g = dL / d log alpha and d = pixel - centre, then the gradient of the three colours.
 constexpr int SUMS = 9;
 
-// Replay one tile from its last fragment to its first. `kept` is the transmittance behind everything, `masks` ends with the
-// tile's; v_rgb [H, W, 3], v_alpha [H, W]; totals [splats, 16] belongs to this thread. With c a fragment's colour under
-// v_rgb and B the same of all behind it, dL / d log alpha = alpha T (c - B).
+// Replay one tile from its last fragment to its first. `kept` is the transmittance behind everything, `masks` ends with
+// the tile's; v_rgb [H, W, 3], v_alpha [H, W]; totals [splats, 16] belongs to this thread. With c a fragment's colour
+// under v_rgb and B the same of all behind it, dL / d log alpha = alpha T (c - B).
 inline void walk_back(const Scene &scene, int tile, const Lanes *kept, const uint16_t *rows, const Mask *masks,
                       const float *v_rgb, const float *v_alpha, float *totals) {
   const int left = scene.left(tile), top = scene.top(tile), columns = std::min(TILE, scene.width - left);
