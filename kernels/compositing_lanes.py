@@ -9,7 +9,8 @@ from functools import cache
 
 import warp as wp
 
-from sgwarp.kernels.binning import TILE, Fragment
+from sgwarp.kernels.binning import AHEAD, TILE, Fragment, fragment_of, prefetch
+from sgwarp.kernels.gaussian import Splat
 from sgwarp.kernels.projection import Knobs
 from sgwarp.kernels.transmittance import (
     HALF_ROW,
@@ -107,7 +108,8 @@ def color_walk(depth: bool, record: bool) -> wp.Function:
         tile: int,
         slot: int,
         offsets: wp.array[int],
-        fragments: wp.array[Fragment],
+        listed: wp.array[int],
+        splats: wp.array[Splat],
         knobs: Knobs,
         width: int,
         height: int,
@@ -126,10 +128,12 @@ def color_walk(depth: bool, record: bool) -> wp.Function:
                     state[slot, row, 5] = Lanes(-1.0)
         open_rows = open_row_mask(y0, height)
         first = offsets[tile]
-        for k in range(first, offsets[tile + 1]):
-            f = fragments[k]
+        stop = offsets[tile + 1]
+        for k in range(first, stop):
+            prefetch(splats, listed[wp.min(k + AHEAD, stop - 1)])
+            f = fragment_of(splats, listed[k], x0, y0)
             for row in range(f.first_row, f.last_row + 1):
-                if row_is_reached(f, row, knobs) and (open_rows >> row) & 1 != 0:
+                if (open_rows >> row) & 1 != 0:
                     T = state[slot, row, 0]
                     alphas = lane_alphas(f, row, knobs)
                     w = lane_contributions(alphas, T, knobs)
@@ -175,6 +179,24 @@ def latest(w: Lanes, k: float, last: Lanes) -> Lanes:
 
 
 @wp.func
+def write_last(
+    slot: int,
+    x0: int,
+    y0: int,
+    width: int,
+    height: int,
+    state: wp.array3d[Lanes],
+    plane: int,
+    last_out: wp.array2d[int],
+):
+    """Last contributors of a tile, from lanes to pixels."""
+    for row in range(wp.min(TILE, height - y0)):
+        last = state[slot, row, plane]
+        for i in range(wp.min(LANES, width - x0)):
+            last_out[y0 + row, x0 + i] = int(last[i])
+
+
+@wp.func
 def write_colors(
     slot: int,
     x0: int,
@@ -197,17 +219,24 @@ def write_colors(
 
 
 @cache
-def make_composite_colors(depth: bool) -> wp.Kernel:
-    """Kernel that composites three packed channels; with `depth` also sum of alpha T z and the surface depth."""
-    walk = color_walk(depth, False)
+def make_composite_colors(depth: bool, record: bool) -> wp.Kernel:
+    """Kernel that composites three channels that travel with the splats.
+
+    Args:
+        depth: Also write the sum of alpha T z and the surface depth.
+        record: Also write what the backward pass starts from.
+    """
+    walk = color_walk(depth, record)
+    last_plane = color_planes(depth, record) - 1
 
     @wp.kernel(module="unique", module_options=LANE_OPTIONS, enable_backward=False)
     def composite_colors(
         # In:
         base: int,  # first tile of this launch
         slot: int,  # scratch of this launch
-        offsets: wp.array[int],  # [tiles + 1] first fragment of each tile
-        fragments: wp.array[Fragment],  # [I]
+        offsets: wp.array[int],  # [tiles + 1] first place of each tile
+        listed: wp.array[int],  # [I] ranks, tile by tile, front to back
+        splats: wp.array[Splat],  # [V] in depth order
         knobs: Knobs,
         width: int,  # [pixels]
         height: int,
@@ -215,23 +244,36 @@ def make_composite_colors(depth: bool) -> wp.Kernel:
         # Out:
         colors_out: wp.array2d[wp.vec3],  # [H, W] sum of alpha T color
         transmittance_out: wp.array2d[float],  # [H, W]
-        depth_sum_out: wp.array2d[float],  # [H, W] sum of alpha T z [m]
-        surface_out: wp.array2d[float],  # [H, W] z where accumulated opacity passes alpha_d [m], 0 = no hit
+        depth_sum_out: wp.array2d[float],  # [H, W] sum of alpha T z [m] (depth)
+        surface_out: wp.array2d[float],  # [H, W] z where accumulated opacity passes alpha_d [m], 0 = no hit (depth)
+        last_out: wp.array2d[int],  # [H, W] last contributor, counted from its tile's first, -1 = none (record)
+        hit_out: wp.array2d[int],  # [H, W] Gaussian of `surface_out`, -1 = no hit (depth and record)
     ):
         """Paper eq. 1 for one tile per thread."""
         tile = base + wp.tid()
         columns = (width + TILE - 1) / TILE
         x0 = (tile % columns) * TILE
         y0 = (tile / columns) * TILE
-        walk(tile, slot, offsets, fragments, knobs, width, height, state)
+        walk(tile, slot, offsets, listed, splats, knobs, width, height, state)
         write_colors(slot, x0, y0, width, height, state, colors_out, transmittance_out)
+        if wp.static(record):
+            write_last(slot, x0, y0, width, height, state, last_plane, last_out)
         if wp.static(depth):
             for row in range(wp.min(TILE, height - y0)):
                 z = state[slot, row, 4]
                 surface = state[slot, row, 5]
                 for i in range(wp.min(LANES, width - x0)):
                     depth_sum_out[y0 + row, x0 + i] = z[i]
-                    surface_out[y0 + row, x0 + i] = surface[i]
+                    d = surface[i]
+                    if wp.static(record):
+                        hit = int(-1)
+                        d = float(0.0)
+                        if surface[i] >= 0.0:
+                            splat = splats[listed[offsets[tile] + int(surface[i])]]
+                            d = splat.depth
+                            hit = splat.gaussian
+                        hit_out[y0 + row, x0 + i] = hit
+                    surface_out[y0 + row, x0 + i] = d
 
     return composite_colors
 
@@ -279,7 +321,8 @@ def feature_walk(slices: int, record: bool) -> wp.Function:
         tile: int,
         slot: int,
         offsets: wp.array[int],
-        fragments: wp.array[Fragment],
+        listed: wp.array[int],
+        splats: wp.array[Splat],
         features: wp.array3d[Lanes],
         first_slice: int,
         knobs: Knobs,
@@ -309,7 +352,7 @@ def feature_walk(slices: int, record: bool) -> wp.Function:
                     count = int(0)
                     T = state[slot, row, 0]
                     for k in range(start, end):
-                        f = fragments[k]
+                        f = fragment_of(splats, listed[k], x0, y0)
                         if row_is_reached(f, row, knobs):
                             alphas = lane_alphas(f, row, knobs)
                             w = lane_contributions(alphas, T, knobs)
@@ -360,9 +403,9 @@ def feature_writer(slices: int) -> wp.Function:
 
 
 @cache
-def make_composite_features(slices: int) -> wp.Kernel:
-    """Kernel that composites passes of `16 slices` channels."""
-    walk = feature_walk(slices, False)
+def make_composite_features(slices: int, record: bool) -> wp.Kernel:
+    """Kernel that composites passes of `16 slices` channels; with `record` also what the backward pass starts from."""
+    walk = feature_walk(slices, record)
     write = feature_writer(slices)
 
     @wp.kernel(module="unique", module_options=LANE_OPTIONS, enable_backward=False)
@@ -371,25 +414,29 @@ def make_composite_features(slices: int) -> wp.Kernel:
         base: int,
         slot: int,
         offsets: wp.array[int],  # [tiles + 1]
-        fragments: wp.array[Fragment],  # [I]
+        listed: wp.array[int],  # [I]
+        splats: wp.array[Splat],  # [V]
         features: wp.array3d[Lanes],  # [N, S, 1] channels in slices of 16
         first_slice: int,  # of this pass
         knobs: Knobs,
         width: int,
         height: int,
-        state: wp.array3d[Lanes],  # [slots, 16, 1 + 16 slices] scratch
+        state: wp.array3d[Lanes],  # [slots, 16, 1 + 16 slices (+ 1)] scratch
         weights: wp.array3d[Lanes],  # [slots, 16, BATCH] scratch
         owners: wp.array3d[int],  # [slots, 16, BATCH] scratch
         # Out:
         features_out: wp.array3d[float],  # [H, W, C] sum of alpha T x
         transmittance_out: wp.array2d[float],  # [H, W]
+        last_out: wp.array2d[int],  # [H, W] last contributor, counted from its tile's first, -1 = none (record)
     ):
         """Paper eq. 1 for any number of channels."""
         tile = base + wp.tid()
         columns = (width + TILE - 1) / TILE
         x0 = (tile % columns) * TILE
         y0 = (tile / columns) * TILE
-        walk(tile, slot, offsets, fragments, features, first_slice, knobs, width, height, state, weights, owners)
+        walk(tile, slot, offsets, listed, splats, features, first_slice, knobs, width, height, state, weights, owners)
         write(slot, x0, y0, first_slice, width, height, state, features_out, transmittance_out)
+        if wp.static(record):
+            write_last(slot, x0, y0, width, height, state, wp.static(1 + PASS * slices), last_out)
 
     return composite_features

@@ -41,7 +41,10 @@ class Pinhole:
 
 @wp.struct
 class Splat:
-    """A projected Gaussian: alpha(dx, dy) = 2^(level - u^2 - v^2), u = a dx + b dy, v = c dy."""
+    """A projected Gaussian: alpha(dx, dy) = 2^(level - u^2 - v^2), u = a dx + b dy, v = c dy.
+
+    64 bytes, one line of the cache. The last fields are filled in once the splats lie in depth order.
+    """
 
     mean: wp.vec2  # [pixels]
     a: float
@@ -51,6 +54,11 @@ class Splat:
     depth: float  # z in the camera frame [m]
     half_width: float  # of the footprint {alpha >= alpha_min} [pixels]
     half_height: float
+    reach: float  # the footprint is u^2 + v^2 <= reach
+    summit: float  # dy at which its right border is furthest right [pixels]
+    gaussian: int
+    color: wp.vec3
+    spare: int
 
 
 @wp.func
@@ -108,33 +116,27 @@ def factor_determinant(m_x: wp.vec3, m_y: wp.vec3) -> float:
 
 
 @wp.func
-def footprint(splat: Splat, alpha_min_level: float) -> float:
-    """q such that alpha >= alpha_min where u^2 + v^2 <= q."""
-    return splat.level - alpha_min_level + LEVEL_SLACK
-
-
-@wp.func
-def footprint_summit(splat: Splat, q: float) -> float:
+def footprint_summit(splat: Splat) -> float:
     """dy at which the right border of the footprint is furthest right [pixels]."""
-    return -splat.b * wp.sqrt(q / (splat.b * splat.b + splat.c * splat.c)) / splat.c
+    return -splat.b * wp.sqrt(splat.reach / (splat.b * splat.b + splat.c * splat.c)) / splat.c
 
 
 @wp.func
-def column_range(splat: Splat, q: float, summit: float, y_first: float, y_last: float):
+def column_range(splat: Splat, y_first: float, y_last: float):
     """Exact range of x [pixels] that the footprint covers between two heights; empty if first > second.
 
-    The right border x(y) = (-b y + sqrt(q - c^2 y^2)) / a is concave, so its largest value over a band lies at the
+    The right border x(y) = (-b y + sqrt(reach - c^2 y^2)) / a is concave, so its largest value over a band lies at the
     summit or at the end of the band nearest to it; the left border mirrors it.
     """
     lo = wp.max(y_first - splat.mean[1], -splat.half_height)
     hi = wp.min(y_last - splat.mean[1], splat.half_height)
-    y_right = wp.clamp(summit, lo, hi)
-    y_left = wp.clamp(-summit, lo, hi)
+    y_right = wp.clamp(splat.summit, lo, hi)
+    y_left = wp.clamp(-splat.summit, lo, hi)
     cr = splat.c * y_right
     cl = splat.c * y_left
     inv_a = 1.0 / splat.a
-    right = (wp.sqrt(wp.max(q - cr * cr, 0.0)) - splat.b * y_right) * inv_a
-    left = (-wp.sqrt(wp.max(q - cl * cl, 0.0)) - splat.b * y_left) * inv_a
+    right = (wp.sqrt(wp.max(splat.reach - cr * cr, 0.0)) - splat.b * y_right) * inv_a
+    left = (-wp.sqrt(wp.max(splat.reach - cl * cl, 0.0)) - splat.b * y_left) * inv_a
     right = wp.where(lo > hi, -1.0e30, right)
     left = wp.where(lo > hi, 1.0e30, left)
     return splat.mean[0] + left, splat.mean[0] + right

@@ -66,7 +66,8 @@ def sum_rows(
     base: int,  # first entry of `order` in this launch
     order: wp.array[int],  # [V] visible Gaussians
     entries: wp.array[int],  # [V + 1] first intersection of each
-    rows: wp.array2d[Lanes],  # [I, slices]
+    places: wp.array[int],  # [I] where each intersection stands in the tile lists
+    rows: wp.array2d[Lanes],  # [I, slices] by place
     first_slice: int,  # of this pass
     slices: int,
     # Out:
@@ -78,7 +79,7 @@ def sum_rows(
     for s in range(slices):
         total = Lanes(0.0)
         for e in range(entries[k], entries[k + 1]):
-            total += rows[e, s]
+            total += rows[places[e], s]
         features_out[i, first_slice + s] += total
 
 
@@ -88,7 +89,8 @@ def sum_weights(
     base: int,
     order: wp.array[int],  # [V]
     entries: wp.array[int],  # [V + 1]
-    weights: wp.array[float],  # [I] by intersection
+    places: wp.array[int],  # [I]
+    weights: wp.array[float],  # [I] by place
     # Out:
     weight_out: wp.array[float],  # [N] added to
     weight_squared_out: wp.array[float],  # [N] added to: square of this view's total
@@ -98,7 +100,7 @@ def sum_weights(
     i = order[k]
     total = float(0.0)
     for e in range(entries[k], entries[k + 1]):
-        total += weights[e]
+        total += weights[places[e]]
     weight_out[i] += total
     weight_squared_out[i] += total * total
 
@@ -109,8 +111,9 @@ def sum_id_weights(
     base: int,
     order: wp.array[int],  # [V]
     entries: wp.array[int],  # [V + 1]
-    starts: wp.array[int],  # [I] first weight of each intersection, by Gaussian
-    tiles: wp.array[int],  # [I] its tile
+    places: wp.array[int],  # [I]
+    starts: wp.array[int],  # [I] first weight of each intersection, by place
+    tiles: wp.array[int],  # [I] tile of each intersection, by splat
     tile_ids: wp.array2d[int],  # [tiles, 256]
     tile_id_counts: wp.array[int],  # [tiles]
     weights: wp.array[float],  # per fragment one weight for each id of its tile
@@ -129,7 +132,7 @@ def sum_id_weights(
     run_weight = float(0.0)
     for e in range(entries[k], entries[k + 1]):
         tile = tiles[e]
-        start = starts[e]
+        start = starts[places[e]]
         for m in range(tile_id_counts[tile]):
             w = weights[start + m]
             if w > 0.0:

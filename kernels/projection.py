@@ -10,7 +10,9 @@ from sgwarp.kernels.gaussian import (
     Pinhole,
     Splat,
     camera_from_world,
+    ewa_rows,
     factor_determinant,
+    footprint_summit,
     projected_factor,
 )
 
@@ -49,6 +51,24 @@ def is_finite(mean: wp.vec3, quat: wp.vec4, scale: wp.vec3, opacity: float) -> b
     return wp.isfinite(total) and norm2 >= MIN_QUAT_NORM2
 
 
+@wp.func
+def is_far_off_screen(camera: Pinhole, point: wp.vec3, scale: wp.vec3, knobs: Knobs) -> bool:
+    """Whether not even a round, opaque Gaussian of the largest scale would reach the image: no square root is needed.
+
+    Its standard deviation along an image axis is at most scale |J row|, its footprint sqrt(2 ln(1 / alpha_min)) of that.
+    """
+    row_x, row_y = ewa_rows(camera, point)
+    largest = wp.max(scale)
+    reach2 = (LEVEL_SLACK - knobs.alpha_min_level) * 2.0 / LOG2_E
+    width2 = reach2 * (largest * largest * wp.length_sq(row_x) + knobs.dilation)
+    height2 = reach2 * (largest * largest * wp.length_sq(row_y) + knobs.dilation)
+    x = camera.focal[0] * point[0] / point[2] + camera.principal[0]
+    y = camera.focal[1] * point[1] / point[2] + camera.principal[1]
+    away_x = wp.max(wp.max(-x, x - float(camera.width)), 0.0)
+    away_y = wp.max(wp.max(-y, y - float(camera.height)), 0.0)
+    return away_x * away_x > width2 or away_y * away_y > height2
+
+
 @wp.kernel
 def project_gaussians(
     # In:
@@ -81,6 +101,10 @@ def project_gaussians(
         status_out[i] = wp.uint8(OUTSIDE_DEPTH)
         return
 
+    if is_far_off_screen(camera, point, scale, knobs):
+        status_out[i] = wp.uint8(OFF_SCREEN)
+        return
+
     m_x, m_y = projected_factor(camera, point, quat, scale)
     xx = wp.length_sq(m_x)
     yy = wp.length_sq(m_y)
@@ -111,10 +135,11 @@ def project_gaussians(
     splat.c = unit / wp.sqrt(yy)
     splat.level = wp.log2(opacity)
     splat.depth = point[2]
-    q = splat.level - knobs.alpha_min_level + LEVEL_SLACK
-    reach = wp.sqrt(q) / unit
-    splat.half_width = reach * wp.sqrt(xx)
-    splat.half_height = reach * wp.sqrt(yy)
+    splat.reach = splat.level - knobs.alpha_min_level + LEVEL_SLACK
+    sigmas = wp.sqrt(splat.reach) / unit
+    splat.half_width = sigmas * wp.sqrt(xx)
+    splat.half_height = sigmas * wp.sqrt(yy)
+    splat.summit = footprint_summit(splat)
     x = splat.mean[0]
     y = splat.mean[1]
     inside = x + splat.half_width >= 0.5 and x - splat.half_width <= float(camera.width) - 0.5

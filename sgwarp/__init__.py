@@ -21,6 +21,7 @@ if TYPE_CHECKING:
     from sgwarp.io.store import save_semantics as save_semantics
     from sgwarp.io.views import load_views as load_views
     from sgwarp.lift import lift as lift
+    from sgwarp.ops.contributors import top_contributors as top_contributors
     from sgwarp.ops.settings import RasterSettings as RasterSettings
     from sgwarp.orbit import orbit_views as orbit_views
     from sgwarp.query import evidence as evidence
@@ -65,6 +66,7 @@ _HOME = {
     "select": "sgwarp.query",
     "standardise": "sgwarp.query",
     "text_encoder_for": "sgwarp.encoders.registry",
+    "top_contributors": "sgwarp.ops.contributors",
 }
 __all__ = [*_HOME, "__version__"]
 

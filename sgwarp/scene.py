@@ -87,6 +87,13 @@ class Gaussians:
         outside = (self.opacities < 0) | (self.opacities > 1)
         _first_bad("opacities", outside, "expected a value in [0, 1]; apply the sigmoid to logits", self.opacities)
 
+    @classmethod
+    def unchecked(cls, means: Tensor, quats: Tensor, scales: Tensor, opacities: Tensor, sh: Tensor) -> Gaussians:
+        """Gaussians of tensors that are known to be float32, contiguous and of the right shapes; nothing is read."""
+        gaussians = object.__new__(cls)
+        gaussians.__dict__.update(means=means, quats=quats, scales=scales, opacities=opacities, sh=sh)
+        return gaussians
+
     def __len__(self) -> int:
         return len(self.means)
 

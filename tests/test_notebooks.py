@@ -16,7 +16,7 @@ NOTEBOOKS = sorted(FOLDER.glob("*.py"))
 
 
 def test_there_are_notebooks():
-    assert FOLDER / "01_kernels.py" in NOTEBOOKS
+    assert {"01_kernels", "02_swap_in"} <= {path.stem for path in NOTEBOOKS}
 
 
 @pytest.mark.parametrize("path", NOTEBOOKS, ids=lambda path: path.stem)
@@ -79,3 +79,22 @@ def test_kernels(run, capsys):
     assert weighted[-1] > over_a_tenth[-1] > centre[-1] > 0.8
     for shares in found["coverage"].values():
         assert shares == sorted(shares)
+
+
+def test_swap_in(run):
+    found, figures = run("02_swap_in.py")
+    assert figures == 5
+    calls = {"gsplat's call", "Inria's call"}
+    assert found["image_differences"].keys() == found["losses"].keys() == calls
+    assert max(found["image_differences"].values()) < 5e-6
+    for differences in found["gradient_differences"].values():
+        assert differences.keys() == found["RATES"].keys()
+        assert max(differences.values()) < 2e-5
+    assert found["proxy_difference"] < 1e-6
+    assert found["seen"].sum() > 1000
+    assert found["same_bits"]
+    assert found["apart"][:40].max() < 1e-3
+    for name in calls:
+        losses = found["losses"][name]
+        assert losses[-12:].mean() < 0.2 * losses[:12].mean()
+        assert found["quality"][name] > 21

@@ -65,7 +65,8 @@ def rasterize_differentiable(
         deterministic: Add gradients up in a fixed order. The CPU always does; on CUDA the default is atomic additions.
 
     Raises:
-        InputError: Shapes do not fit, a scale is negative, an opacity outside [0, 1], or the camera is not valid.
+        InputError: Shapes do not fit, or the camera is not valid; on the CPU also: a scale is negative or an opacity
+            outside [0, 1].
     """
     if (sh is None) == (features is None):
         raise InputError("give exactly one of sh [N, K, 3] and features [N, C]")
@@ -84,6 +85,7 @@ def rasterize_differentiable(
     if background is not None and tuple(background.shape) != (channels,):
         raise InputError(f"background: expected shape [{channels}], got {list(background.shape)}")
 
+    _check_fields(means, quats, scales, opacities)
     camera = Camera(K, viewmat, width, height, near, far)
     inputs = (means, quats, scales, opacities, values, viewmat, means2d, background)
     if not (torch.is_grad_enabled() and any(t is not None and t.requires_grad for t in inputs)):
@@ -113,7 +115,23 @@ def rasterize_differentiable(
     mean_depth = None
     if expected_depth:
         mean_depth = torch.where(alpha > 0, depth_sum / alpha.clamp(min=1e-12), 0.0)
-    return Rendering(image, alpha, mean_depth, surface if depth else None, request.culled)
+    return Rendering(image, alpha, mean_depth, surface if depth else None, request.status_counts)
+
+
+def _check_fields(means: Tensor, quats: Tensor, scales: Tensor, opacities: Tensor) -> None:
+    """Shapes and types always; values on the CPU only, since on CUDA to look at them is to wait for the device."""
+    n = len(means)
+    fields = {"means": (means, (n, 3)), "quats": (quats, (n, 4)), "scales": (scales, (n, 3))}
+    for name, (tensor, shape) in (fields | {"opacities": (opacities, (n,))}).items():
+        if tuple(tensor.shape) != shape or not tensor.is_floating_point():
+            got = f"{tensor.dtype} {list(tensor.shape)}"
+            raise InputError(f"{name}: expected floating point {list(shape)}, got {got}")
+    if n == 0 or means.is_cuda:
+        return
+    with torch.no_grad():
+        lowest, highest = opacities.aminmax()
+        if not (scales.min() >= 0 and lowest >= 0 and highest <= 1):  # or NaN, which is no error
+            Gaussians(means, quats, scales, opacities, means.new_zeros(n, 1, 3))
 
 
 @dataclass(eq=False)
@@ -127,7 +145,7 @@ class _Request:
     receives_absgrad: Tensor | None
     schedule: str | None
     deterministic: bool | None
-    culled: dict[str, int] = field(default_factory=dict)
+    status_counts: Tensor = field(default_factory=lambda: torch.empty(0, dtype=torch.int64))
 
 
 class _Rasterize(torch.autograd.Function):
@@ -151,13 +169,13 @@ class _Rasterize(torch.autograd.Function):
         projected = tiles.project(gaussians, camera, settings)
         order = tiles.depth_order(projected)
         colors = packed_colors(gaussians, camera, features, order, settings)
-        lists = tiles.bin_splats(projected, order, colors, camera, settings, keep=True)
+        lists = tiles.bin_splats(projected, order, colors, camera, places=True, keep=True)
         image, transmittance, depth_sum, surface, last, hit = composite_recorded(
             lists, camera, settings, features, request.wants_depth, request.schedule
         )
-        request.culled = projected.culled()
-        kept = (lists.order, lists.entries, lists.offsets, lists.memory, transmittance, last, hit)
-        ctx.save_for_backward(means, quats, scales, opacities, values, viewmat, *kept)
+        request.status_counts = projected.counts()
+        recorded = (transmittance, last, hit)
+        ctx.save_for_backward(means, quats, scales, opacities, values, viewmat, *recorded, *vars(lists).values())
         ctx.request = request
         ctx.channels = image.shape[2]
         ctx.set_materialize_grads(False)
@@ -174,18 +192,16 @@ class _Rasterize(torch.autograd.Function):
     ) -> tuple[Tensor | None, ...]:
         request: _Request = ctx.request
         camera, settings = request.camera, request.settings
-        means, quats, scales, opacities, values, viewmat, order, entries, offsets, memory, *recorded = ctx.saved_tensors
+        means, quats, scales, opacities, values, viewmat, *kept = ctx.saved_tensors
         gaussians = _gaussians(means, quats, scales, opacities, values, request)
-        fragments = tiles.as_fragments(memory)
-        nothing = order[:0]
-        lists = tiles.TileLists(order, entries, offsets, fragments, fragments.size, nothing, nothing, memory)
+        recorded, lists = (kept[0], kept[1], kept[2]), tiles.TileLists(*kept[3:])
         splats = backward.composite_backward(
             lists,
             camera,
             settings,
             None if request.harmonics else values,
             ctx.channels,
-            tuple(recorded),
+            recorded,
             backward.ImageGradients(v_image, v_transmittance, v_depth_sum, v_surface),
             len(means),
             absolute=request.receives_absgrad is not None,
@@ -216,7 +232,7 @@ def _gaussians(
     means: Tensor, quats: Tensor, scales: Tensor, opacities: Tensor, values: Tensor, request: _Request
 ) -> Gaussians:
     sh = values if request.harmonics else means.new_zeros(len(means), 1, 3)
-    return Gaussians(means.detach(), quats.detach(), scales.detach(), opacities.detach(), sh.detach())
+    return Gaussians.unchecked(*(t.detach() for t in (means, quats, scales, opacities, sh)))
 
 
 def _accumulate(tensor: Tensor, absolute: Tensor | None) -> None:

@@ -91,7 +91,9 @@ def lift_view(
         raise InputError(f"feature map: {got}, but the sums hold {sums.channels} for {len(sums.weight)}")
     projected = tiles.project(gaussians, camera, settings)
     order = tiles.depth_order(projected)
-    lists = tiles.bin_splats(projected, order, None, camera, settings, places=feature_map.ids is not None)
+    by_rows = mode == "weighted"
+    wants_tiles = by_rows and feature_map.ids is not None
+    lists = tiles.bin_splats(projected, order, None, camera, places=by_rows, tiles=wants_tiles)
     if mode == "center":
         _add_centers(projected, lists, camera, feature_map, sums, tau, border, settings)
         return
@@ -157,7 +159,7 @@ def _add_dense_pass(
     height, width = camera.size
     total = lists.intersections
     first_feature, first, count = place
-    common = [view(lists.offsets, wp.int32), lists.fragments, view(features, Lanes)]
+    common = [*lists.arrays(), view(features, Lanes)]
     knobs = tiles.knobs(settings)
     rows = scratch("rows", total * count * LANE if ordered else 0, torch.float32, device).view(-1, count, LANE)
     weights = scratch("entry weights", total if ordered else 0, torch.float32, device)
@@ -183,7 +185,7 @@ def _add_dense_pass(
         outputs = [view(rows, Lanes), view(weights, wp.float32)]
         kernel = lifting_lanes.make_lift_dense(count)
         launch(kernel, lists.tile_count, inputs, outputs, device=device, slots=True)
-    gather = [view(lists.order, wp.int32), view(lists.entries, wp.int32)]
+    gather = lists.sums()
     visible = len(lists.order)
     launch(
         lifting.sum_rows, visible, [*gather, view(rows, Lanes), first, count], [view(sums.slices, Lanes)], device=device
@@ -265,7 +267,7 @@ def _add_ids(
         rows = len(sums.weight) if atomic else visible
         id_weights = scratch("id weights", rows * known, torch.float32, device).view(rows, known).zero_()
     knobs = tiles.knobs(settings)
-    common = [view(lists.offsets, wp.int32), lists.fragments]
+    common = lists.arrays()
     row_places = view(row_starts, wp.int32)
     if atomic:
         view_weights = torch.zeros_like(sums.weight)
@@ -290,7 +292,7 @@ def _add_ids(
         order = view(torch.arange(len(sums.weight), dtype=torch.int32, device=device), wp.int32)
         visible = len(sums.weight)
     else:
-        where = [view(t, wp.int32) for t in (lists.entries, starts, lists.tiles)]
+        where = [view(t, wp.int32) for t in (lists.entries, lists.places, starts, lists.tiles)]
         names = [view(tile_ids, wp.int32), view(id_counts, wp.int32), view(weights, wp.float32)]
         outputs = [view(t, wp.float32) for t in (id_weights, sums.weight, sums.weight_squared)]
         launch(lifting.sum_id_weights, visible, [order, *where, *names, int(one_hot)], outputs, device=device)

@@ -9,7 +9,7 @@ import warp as wp
 from torch import Tensor
 
 from sgwarp.errors import InputError
-from sgwarp.kernels import compositing_block, compositing_lanes, compositing_lanes_record
+from sgwarp.kernels import compositing_block, compositing_lanes
 from sgwarp.kernels.transmittance import Lanes
 from sgwarp.ops import tiles
 from sgwarp.ops.launch import get_threads, launch, launch_blocks, scratch, view
@@ -30,14 +30,19 @@ class Rendering:
         expected_depth: Mean z weighted by alpha T [m], 0 where nothing is, float32 [H, W]; None if not asked for.
         depth: z of the Gaussian at which accumulated opacity passes `surface_opacity` [m], 0 = no hit, float32 [H, W];
             None if not asked for.
-        culled: Gaussians left out, by reason.
+        status_counts: How many Gaussians had each status of kernels/projection.py, int64.
     """
 
     features: Tensor
     alpha: Tensor
     expected_depth: Tensor | None
     depth: Tensor | None
-    culled: dict[str, int]
+    status_counts: Tensor
+
+    @property
+    def culled(self) -> dict[str, int]:
+        """Gaussians left out, by reason; reading it waits for the device."""
+        return tiles.culled(self.status_counts)
 
 
 def rasterize(
@@ -75,7 +80,7 @@ def rasterize(
     projected = tiles.project(gaussians, camera, settings)
     order = tiles.depth_order(projected)
     colors = packed_colors(gaussians, camera, features, order, settings)
-    lists = tiles.bin_splats(projected, order, colors, camera, settings)
+    lists = tiles.bin_splats(projected, order, colors, camera)
     wants_depth = expected_depth or depth
     image, transmittance, depth_sum, surface = composite(lists, camera, settings, features, wants_depth)
     if background is not None:
@@ -84,13 +89,13 @@ def rasterize(
     mean_depth = None
     if expected_depth:
         mean_depth = torch.where(alpha > 0, depth_sum / alpha.clamp(min=1e-12), 0.0)
-    return Rendering(image, alpha, mean_depth, surface if depth else None, projected.culled())
+    return Rendering(image, alpha, mean_depth, surface if depth else None, projected.counts())
 
 
 def packed_colors(
     gaussians: Gaussians, camera: Camera, features: Tensor | None, order: Tensor, settings: RasterSettings
 ) -> Tensor | None:
-    """Colours by depth order. Three channels travel with the fragments; more are gathered while compositing."""
+    """Colours by depth order. Three channels travel with the splats; more are gathered while compositing."""
     if features is None:
         return tiles.shade(gaussians, camera, order, settings)
     if features.shape[1] > 3:
@@ -112,7 +117,8 @@ def composite(
 
     `schedule` is "lanes" or "block", by default the device's own; either runs on the CPU.
     """
-    return _composite(lists, camera, settings, features, wants_depth, schedule, None, None)
+    nothing = torch.empty(0, 0, dtype=torch.int32, device=lists.order.device)
+    return _composite(lists, camera, settings, features, wants_depth, schedule, nothing, nothing)
 
 
 def composite_recorded(
@@ -125,7 +131,7 @@ def composite_recorded(
 ) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor, Tensor]:
     """`composite` and what its backward pass starts from, int32 [H, W] each.
 
-    `last` is the last contributing fragment, counted from the first of its tile; `hit` is the Gaussian that gave the
+    `last` is the last contributor, counted from the first of its tile; `hit` is the Gaussian that gave the
     surface depth, empty without `wants_depth`. Both are -1 where there is none.
     """
     device = lists.order.device
@@ -146,8 +152,8 @@ def _composite(
     features: Tensor | None,
     wants_depth: bool,
     schedule: str | None,
-    last: Tensor | None,
-    hit: Tensor | None,
+    last: Tensor,
+    hit: Tensor,
 ) -> tuple[Tensor, Tensor, Tensor, Tensor]:
     device = lists.order.device
     block = runs_in_blocks(device, schedule)
@@ -162,19 +168,16 @@ def _composite(
         image = _composite_wide(lists, camera, settings, features, transmittance, last, block)
     if not wide or wants_depth:
         colors = torch.empty(height, width, 3, device=device)
-        inputs = [view(lists.offsets, wp.int32), lists.fragments, tiles.knobs(settings), width, height]
+        inputs = [*lists.arrays(), tiles.knobs(settings), width, height]
         outputs = [view(colors, wp.vec3), *(view(t, wp.float32) for t in (transmittance, depth_sum, surface))]
-        if last is not None and hit is not None:
-            outputs += [view(last, wp.int32), view(hit, wp.int32)]
+        outputs += [view(last, wp.int32), view(hit, wp.int32)]
+        record = len(last) > 0
         if block:
-            make = compositing_block.make_composite_colors_block
-            kernel = (make if last is None else compositing_block.make_record_colors_block)(wants_depth)
+            kernel = compositing_block.make_composite_colors_block(wants_depth, record)
             launch_blocks(kernel, [lists.tile_count], inputs, outputs, device=device)
         else:
-            make = compositing_lanes.make_composite_colors
-            kernel = (make if last is None else compositing_lanes_record.make_record_colors)(wants_depth)
-            planes = compositing_lanes.color_planes(wants_depth, last is not None)
-            state = lane_scratch("state", TILE_ROWS, planes, device)
+            state = lane_scratch("state", TILE_ROWS, compositing_lanes.color_planes(wants_depth, record), device)
+            kernel = compositing_lanes.make_composite_colors(wants_depth, record)
             launch(kernel, lists.tile_count, [*inputs, state], outputs, device=device, slots=True)
         if image is None:
             image = colors if features is None else colors[..., : features.shape[1]]
@@ -208,7 +211,7 @@ def _composite_wide(
     settings: RasterSettings,
     features: Tensor,
     transmittance: Tensor,
-    last: Tensor | None,
+    last: Tensor,
     block: bool,
 ) -> Tensor:
     device = lists.order.device
@@ -216,15 +219,13 @@ def _composite_wide(
     image = torch.empty(height, width, features.shape[1], device=device)
     slices = in_slices(features)
     count = slices.shape[1]
-    lead = [view(lists.offsets, wp.int32), lists.fragments]
     tail = [tiles.knobs(settings), width, height]
-    outputs = [view(image, wp.float32), view(transmittance, wp.float32)]
-    if last is not None:
-        outputs.append(view(last, wp.int32))
+    outputs = [view(image, wp.float32), view(transmittance, wp.float32), view(last, wp.int32)]
+    record = len(last) > 0
     if block:
-        make_block = compositing_block.make_composite_features_block
-        kernel = (make_block if last is None else compositing_block.make_record_features_block)()
-        launch_blocks(kernel, [lists.tile_count, count], [*lead, view(slices, Lanes), *tail], outputs, device=device)
+        kernel = compositing_block.make_composite_features_block(record)
+        inputs = [*lists.arrays(), view(slices, Lanes), *tail]
+        launch_blocks(kernel, [lists.tile_count, count], inputs, outputs, device=device)
         return image
     batch = compositing_lanes.BATCH
     weights = lane_scratch("weights", TILE_ROWS, batch, device)
@@ -233,10 +234,9 @@ def _composite_wide(
     first = 0
     while first < count:
         width_of_pass = WIDE_PASS if count - first >= WIDE_PASS else 1
-        make = compositing_lanes.make_composite_features
-        kernel = (make if last is None else compositing_lanes_record.make_record_features)(width_of_pass)
-        state = lane_scratch("state", TILE_ROWS, 1 + LANE * width_of_pass + (last is not None), device)
-        inputs = [*lead, view(slices.unsqueeze(2), Lanes), first, *tail, state, weights, owner_array]
+        kernel = compositing_lanes.make_composite_features(width_of_pass, record)
+        state = lane_scratch("state", TILE_ROWS, 1 + LANE * width_of_pass + record, device)
+        inputs = [*lists.arrays(), view(slices.unsqueeze(2), Lanes), first, *tail, state, weights, owner_array]
         launch(kernel, lists.tile_count, inputs, outputs, device=device, slots=True)
         first += width_of_pass
     return image
