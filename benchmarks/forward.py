@@ -25,7 +25,7 @@ def compositing(count: int, cores: int, rounds: int) -> dict[str, float]:
     projected = tiles.project(gaussians, camera, SETTINGS)
     order = tiles.depth_order(projected)
     colors = tiles.shade(gaussians, camera, order, SETTINGS)
-    lists = tiles.bin_splats(projected, order, colors, camera, SETTINGS, keep=True)
+    lists = tiles.bin_splats(projected, order, colors, camera, keep=True)
     runs: dict[str, Run] = {}
     for threads in sorted({1, cores}):
         mark = plural(threads)
@@ -50,7 +50,7 @@ def channels(count: int, width: int, cores: int, rounds: int) -> dict[str, float
     projected = tiles.project(gaussians, camera, SETTINGS)
     order = tiles.depth_order(projected)
     colors = packed_colors(gaussians, camera, features, order, SETTINGS)
-    lists = tiles.bin_splats(projected, order, colors, camera, SETTINGS, keep=True)
+    lists = tiles.bin_splats(projected, order, colors, camera, keep=True)
     runs: dict[str, Run] = {}
     for threads in sorted({1, cores}):
         rival = TrainingLimit(gaussians, camera, threads, features)

@@ -49,7 +49,7 @@ def probe(count: int, width: int, height: int) -> dict[str, int]:
     peak = resident("VmHWM") - before
     settings = RasterSettings()
     projected = tiles.project(gaussians, camera, settings)
-    lists = tiles.bin_splats(projected, tiles.depth_order(projected), None, camera, settings)
+    lists = tiles.bin_splats(projected, tiles.depth_order(projected), None, camera)
     return {"count": count, "pixels": width * height, "intersections": lists.intersections, "bytes": peak}
 
 
