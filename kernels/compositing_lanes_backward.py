@@ -25,16 +25,12 @@ from sgwarp.kernels.binning import AHEAD, TILE, fragment_of, prefetch
 from sgwarp.kernels.compositing_rows import fragment_replay
 from sgwarp.kernels.gaussian import Splat
 from sgwarp.kernels.projection import Knobs
-from sgwarp.kernels.transmittance import HALF_ROW, LANE_OFFSETS, LANE_OPTIONS, LANES, LaneIds, Lanes
+from sgwarp.kernels.transmittance import LANE_OPTIONS, LaneIds, Lanes
 
 wp.set_module_options(LANE_OPTIONS)
 
 MIN_PASSED = 1.0e-6  # 1 - alpha is never taken for less
-MOST_COLUMNS = 12
-ROW = wp.constant(MOST_COLUMNS)
-SUMS = MOST_COLUMNS + MOST_COLUMNS // 2  # vectors of scratch per fragment: two levels of the tree that sums the lanes
 MOMENTS = 6  # columns of a row: the moments of g, then colours, depth, |d mean| where they are asked for
-BATCH = wp.constant(16)  # fragments whose values under the gradient are computed at a time
 
 
 def row_columns(wide: bool, depth: bool, absolute: bool) -> tuple[int, int, int]:
@@ -42,23 +38,6 @@ def row_columns(wide: bool, depth: bool, absolute: bool) -> tuple[int, int, int]
     at_depth = MOMENTS + (0 if wide else 3)
     at_absolute = at_depth + int(depth)
     return at_depth, at_absolute, at_absolute + 2 * int(absolute)
-
-
-@cache
-def make_fold(half: int) -> wp.Function:
-    """Device function that folds every block of 2 `half` lanes of two vectors in half, and joins them in one."""
-
-    @wp.func
-    def fold(x: Lanes, y: Lanes) -> Lanes:
-        folded = Lanes(0.0)
-        for block in range(wp.static(8 // half)):
-            for i in range(half):
-                low = 2 * half * block + i
-                folded[half * block + i] = x[low] + x[low + half]
-                folded[8 + half * block + i] = y[low] + y[low + half]
-        return folded
-
-    return fold
 
 
 @cache
@@ -71,11 +50,7 @@ def make_composite_backward(wide: bool, depth: bool, absolute: bool) -> wp.Kerne
         depth: The sum of alpha T z has a gradient too; it is the plane after the channels.
         absolute: Also sum the magnitudes of each pixel's gradient of the projected mean.
     """
-    at_depth, at_absolute, columns_of_row = row_columns(wide, depth, absolute)
-    pairs = (columns_of_row + 1) // 2
-    quads = (pairs + 1) // 2
     replay_fragment = fragment_replay(wide, depth, absolute, MIN_PASSED)
-    fold_8, fold_4, fold_2, fold_1 = (make_fold(half) for half in (8, 4, 2, 1))
 
     @wp.kernel(module="unique", module_options=LANE_OPTIONS, enable_backward=False)
     def composite_backward(
@@ -95,7 +70,6 @@ def make_composite_backward(wide: bool, depth: bool, absolute: bool) -> wp.Kerne
         height: int,
         state: wp.array3d[Lanes],  # [slots, 16, 2] scratch: transmittance, value behind
         reach: wp.array2d[int],  # [slots, 16] scratch: last contributor of each row
-        sums: wp.array3d[Lanes],  # [slots, BATCH, SUMS] scratch: rows of a batch before the lanes are summed
         # Out:
         rows_out: wp.array[Lanes],  # [I] by place, column q in lane q
     ):
@@ -117,31 +91,11 @@ def make_composite_backward(wide: bool, depth: bool, absolute: bool) -> wp.Kerne
         first = offsets[tile]
         for k in range(first + tile_reach + 1, offsets[tile + 1]):
             rows_out[k] = Lanes(0.0)
-        for done in range(0, tile_reach + 1, BATCH):
-            newest = tile_reach - done  # counted from the tile's first, as all orders here
-            size = wp.min(BATCH, newest + 1)
-            for b in range(size):
-                order = newest - b
-                prefetch(splats, listed[first + wp.max(order - AHEAD, 0)])
-                f = fragment_of(splats, listed[first + order], x0, y0)
-                replay_fragment(
-                    slot, b, order, column, y0, f, features, last, gradient, knobs, state, reach, sums
-                )
-            # Column q ends up in lane q. Level by level over the whole batch: what was stored just now cannot be read
-            # in other pieces without waiting.
-            for b in range(size):
-                for p in range(pairs):
-                    other = wp.min(2 * p + 1, columns_of_row - 1)
-                    sums[slot, b, ROW + p] = fold_8(sums[slot, b, 2 * p], sums[slot, b, other])
-            for b in range(size):
-                for p in range(quads):
-                    other = wp.min(2 * p + 1, pairs - 1)
-                    sums[slot, b, p] = fold_4(sums[slot, b, ROW + 2 * p], sums[slot, b, ROW + other])
-            for b in range(size):
-                for p in range(2):
-                    other = wp.min(2 * p + 1, quads - 1)
-                    sums[slot, b, ROW + p] = fold_2(sums[slot, b, 2 * p], sums[slot, b, other])
-            for b in range(size):
-                rows_out[first + newest - b] = fold_1(sums[slot, b, ROW], sums[slot, b, ROW + 1])
+        for done in range(tile_reach + 1):
+            order = tile_reach - done  # counted from the tile's first, as all orders here
+            k = first + order
+            prefetch(splats, listed[first + wp.max(order - AHEAD, 0)])
+            f = fragment_of(splats, listed[k], x0, y0)
+            replay_fragment(slot, k, order, column, y0, f, features, last, gradient, knobs, state, reach, rows_out)
 
     return composite_backward

@@ -129,13 +129,25 @@ BACKWARD = """
     const float middle = middle_row, v = f.c * (middle - f.y);
     const Row u = offsets * f.a + (f.b * (middle - f.y) + f.a * (7.5f - f.x));
     const Row gu = u * g0 + f.b * g1, gv = v * g0 + f.c * g1, gu1 = u * g1 + f.b * g2;
-    Row* const out = reinterpret_cast<Row*>(sums.data + (slot * sums.shape[1] + b) * sums.shape[2]);
-    out[0] = g0, out[1] = gu, out[2] = gv;
-    out[3] = u * gu + f.b * gu1, out[4] = v * gu + f.c * gu1, out[5] = v * gv + f.c * (v * g1 + f.c * g2);
+    Row sums[12] = {g0, gu, gv, u * gu + f.b * gu1, v * gu + f.c * gu1, v * gv + f.c * (v * g1 + f.c * g2)};
     int next = 6;
-    if (!WIDE) out[6] = red, out[7] = green, out[8] = blue, next = 9;
-    if (DEPTH) out[next++] = z;
-    if (ABSOLUTE) out[next] = across, out[next + 1] = down;
+    if (!WIDE) sums[6] = red, sums[7] = green, sums[8] = blue, next = 9;
+    if (DEPTH) sums[next++] = z;
+    if (ABSOLUTE) sums[next] = across, sums[next + 1] = down;
+    // Add up the lanes of all columns at once, by halves: column q ends in lane q.
+#define FOLD_8(x, y) __builtin_shufflevector(x, y, 0, 1, 2, 3, 4, 5, 6, 7, 16, 17, 18, 19, 20, 21, 22, 23) \
+                   + __builtin_shufflevector(x, y, 8, 9, 10, 11, 12, 13, 14, 15, 24, 25, 26, 27, 28, 29, 30, 31)
+#define FOLD_4(x, y) __builtin_shufflevector(x, y, 0, 1, 2, 3, 8, 9, 10, 11, 16, 17, 18, 19, 24, 25, 26, 27) \
+                   + __builtin_shufflevector(x, y, 4, 5, 6, 7, 12, 13, 14, 15, 20, 21, 22, 23, 28, 29, 30, 31)
+#define FOLD_2(x, y) __builtin_shufflevector(x, y, 0, 1, 4, 5, 8, 9, 12, 13, 16, 17, 20, 21, 24, 25, 28, 29) \
+                   + __builtin_shufflevector(x, y, 2, 3, 6, 7, 10, 11, 14, 15, 18, 19, 22, 23, 26, 27, 30, 31)
+#define FOLD_1(x, y) __builtin_shufflevector(x, y, 0, 2, 4, 6, 8, 10, 12, 14, 16, 18, 20, 22, 24, 26, 28, 30) \
+                   + __builtin_shufflevector(x, y, 1, 3, 5, 7, 9, 11, 13, 15, 17, 19, 21, 23, 25, 27, 29, 31)
+    const Row p0 = FOLD_8(sums[0], sums[1]), p1 = FOLD_8(sums[2], sums[3]), p2 = FOLD_8(sums[4], sums[5]);
+    const Row p3 = FOLD_8(sums[6], sums[7]), p4 = FOLD_8(sums[8], sums[9]), p5 = FOLD_8(sums[10], sums[11]);
+    const Row q0 = FOLD_4(p0, p1), q1 = FOLD_4(p2, p3), q2 = FOLD_4(p4, p5);
+    const Row r0 = FOLD_2(q0, q1), r1 = FOLD_2(q2, zero);
+    *reinterpret_cast<Row*>(rows.data + place) = FOLD_1(r0, r1);
 """
 
 
@@ -173,7 +185,7 @@ def fragment_replay(wide: bool, depth: bool, absolute: bool, min_passed: float) 
     @wp.func_native(snippet(BACKWARD, **constants))
     def replay_fragment(
         slot: int,
-        b: int,  # of the fragment in its batch
+        place: int,  # of the fragment in the lists
         order: int,  # of the fragment in the tile's list
         column: int,  # of the tile
         y0: int,  # first row of the tile
@@ -184,7 +196,7 @@ def fragment_replay(wide: bool, depth: bool, absolute: bool, min_passed: float) 
         knobs: Knobs,
         state: wp.array3d[Lanes],  # [slots, 16, 2] transmittance, value behind
         reach: wp.array2d[int],  # [slots, 16]
-        sums: wp.array3d[Lanes],  # [slots, BATCH, SUMS] the fragment's row, still a number for every lane
+        rows: wp.array[Lanes],  # [I] by place, column q in lane q
     ): ...
 
     return replay_fragment

@@ -12,7 +12,7 @@ from torch.nn.functional import pad
 
 from sgwarp.kernels import compositing_block_backward, compositing_lanes_backward, harmonics_backward
 from sgwarp.kernels import projection_backward as kernels
-from sgwarp.kernels.compositing_lanes_backward import MOMENTS, SUMS, row_columns
+from sgwarp.kernels.compositing_lanes_backward import MOMENTS, row_columns
 from sgwarp.kernels.transmittance import LaneIds, Lanes
 from sgwarp.ops import tiles
 from sgwarp.ops.launch import get_threads, launch, launch_blocks, scratch, view
@@ -130,7 +130,6 @@ def composite_backward(
         scratches = [
             lane_scratch("backward state", TILE_ROWS, 2, device),
             view(scratch("reach", get_threads() * TILE_ROWS, torch.int32, device).view(-1, TILE_ROWS), wp.int32),
-            lane_scratch("backward sums", LANE, SUMS, device),
         ]
         inputs = [*head, view(slices.unsqueeze(2), Lanes), *maps, *size]
         kernel = compositing_lanes_backward.make_composite_backward(wide, depth, absolute)

@@ -178,7 +178,9 @@ def _composite(
         else:
             state = lane_scratch("state", TILE_ROWS, compositing_lanes.color_planes(wants_depth, record), device)
             kernel = compositing_lanes.make_composite_colors(wants_depth, record)
-            launch(kernel, lists.tile_count, [*inputs, state, *batch_scratch(device)], outputs, device=device, slots=True)
+            launch(
+                kernel, lists.tile_count, [*inputs, state, *batch_scratch(device)], outputs, device=device, slots=True
+            )
         if image is None:
             image = colors if features is None else colors[..., : features.shape[1]]
     assert image is not None

@@ -261,8 +261,8 @@ def bin_by_sorting(
     camera: Camera,
     memory: Tensor,
     *,
-    places: bool,  # noqa: ARG001 - they come with the sort
-    tiles: bool,  # noqa: ARG001
+    places: bool,
+    tiles: bool,
     keep: bool,
 ) -> TileLists:
     """Emit in depth order, sort by tile, list (CUDA); the lists are those of `bin_by_counting`."""
@@ -273,9 +273,7 @@ def bin_by_sorting(
     inputs = [view(order, wp.int32), projected.splats, colors, view(projected.status, wp.uint8), *size]
     launch_plain(binning.count_splat_tiles, count, inputs, [splats, view(splat_counts, wp.int32)], device=device)
     entries, total = _first_places(splat_counts)
-    listed, places_of, tiles_of = (
-        _intersections(name, total, device, keep) for name in ("listed", "places", "tiles")
-    )
+    listed, places_of, tiles_of = (_intersections(name, total, device, keep) for name in ("listed", "places", "tiles"))
     keys = scratch("tile keys", 2 * total, torch.int32, device)
     values = scratch("tile values", 2 * total, torch.int32, device)
     ranks = scratch("tile ranks", total, torch.int32, device)

@@ -7,8 +7,6 @@ import torch
 import warp as wp
 
 from sgwarp.errors import InputError
-from sgwarp.kernels import binning
-from sgwarp.kernels.gaussian import Splat
 from sgwarp.ops import launch, reference, tiles
 from sgwarp.ops.rasterize import composite, rasterize
 from sgwarp.ops.settings import RasterSettings
