@@ -18,6 +18,7 @@ EXACT_OPTIONS = {
 wp.set_module_options(EXACT_OPTIONS)
 
 LOG2_E = wp.constant(1.4426950408889634)
+UNIT = wp.constant(0.8493218002880191)  # sqrt(log2(e) / 2): makes the exponent of a footprint a power of two
 MIN_QUAT_NORM2 = wp.constant(1.0e-6)  # |q|^2 below this has no direction
 LEVEL_SLACK = wp.constant(1.0e-4)  # widens footprints by this many powers of two: culling errs on the safe side
 
@@ -64,21 +65,21 @@ class Splat:
 @wp.func
 def rotation_from_quaternion(q: wp.vec4) -> wp.mat33:
     """Rotation matrix of q = (w, x, y, z), which need not be normalised."""
-    n = q / wp.length(q)
-    w = n[0]
-    x = n[1]
-    y = n[2]
-    z = n[3]
+    s = 2.0 / wp.dot(q, q)
+    x = s * q[1]
+    y = s * q[2]
+    z = s * q[3]
+    wx = x * q[0]
+    wy = y * q[0]
+    wz = z * q[0]
+    xx = x * q[1]
+    xy = x * q[2]
+    xz = x * q[3]
+    yy = y * q[2]
+    yz = y * q[3]
+    zz = z * q[3]
     return wp.mat33(
-        1.0 - 2.0 * (y * y + z * z),
-        2.0 * (x * y - w * z),
-        2.0 * (x * z + w * y),
-        2.0 * (x * y + w * z),
-        1.0 - 2.0 * (x * x + z * z),
-        2.0 * (y * z - w * x),
-        2.0 * (x * z - w * y),
-        2.0 * (y * z + w * x),
-        1.0 - 2.0 * (x * x + y * y),
+        1.0 - (yy + zz), xy - wz, xz + wy, xy + wz, 1.0 - (xx + zz), yz - wx, xz - wy, yz + wx, 1.0 - (xx + yy)
     )
 
 
@@ -113,6 +114,15 @@ def projected_factor(camera: Pinhole, point: wp.vec3, quat: wp.vec4, scale: wp.v
 def factor_determinant(m_x: wp.vec3, m_y: wp.vec3) -> float:
     """det(M M^T) as the sum of squared minors (Cauchy-Binet): exact zero for needles seen end on, never negative."""
     return wp.length_sq(wp.cross(m_x, m_y))
+
+
+@wp.func
+def footprint_factor(xy: float, yy: float, determinant: float):
+    """(a, b, c) of a splat: Cholesky rows of the conic of its dilated covariance, scaled by `UNIT`."""
+    inv_y = 1.0 / wp.sqrt(yy)
+    inv_root = 1.0 / wp.sqrt(determinant)
+    scaled = UNIT * inv_y * inv_root
+    return scaled * yy, -scaled * xy, UNIT * inv_y
 
 
 @wp.func

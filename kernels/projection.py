@@ -7,11 +7,13 @@ from sgwarp.kernels.gaussian import (
     LEVEL_SLACK,
     LOG2_E,
     MIN_QUAT_NORM2,
+    UNIT,
     Pinhole,
     Splat,
     camera_from_world,
     ewa_rows,
     factor_determinant,
+    footprint_factor,
     projected_factor,
 )
 
@@ -122,24 +124,23 @@ def project_gaussians(
             return
 
     splat = Splat()
+    inv_z = 1.0 / point[2]
     splat.mean = wp.vec2(
-        camera.focal[0] * point[0] / point[2] + camera.principal[0],
-        camera.focal[1] * point[1] / point[2] + camera.principal[1],
+        camera.focal[0] * (point[0] * inv_z) + camera.principal[0],
+        camera.focal[1] * (point[1] * inv_z) + camera.principal[1],
     )
-    # Cholesky rows of the conic, scaled so that the exponent is a power of two.
-    unit = wp.sqrt(0.5 * LOG2_E)
-    root = wp.sqrt(determinant)
-    splat.a = unit * wp.sqrt(yy) / root
-    splat.b = -unit * xy / (wp.sqrt(yy) * root)
-    splat.c = unit / wp.sqrt(yy)
+    a, b, c = footprint_factor(xy, yy, determinant)
+    splat.a = a
+    splat.b = b
+    splat.c = c
     splat.level = wp.log2(opacity)
     splat.depth = point[2]
     splat.reach = splat.level - knobs.alpha_min_level + LEVEL_SLACK
-    radius = wp.sqrt(splat.reach)
-    splat.half_width = radius * wp.sqrt(xx) / unit
-    splat.half_height = radius / splat.c
-    splat.inv_bc = 1.0 / wp.sqrt(splat.b * splat.b + splat.c * splat.c)
-    splat.summit = -splat.b * radius * splat.inv_bc / splat.c
+    radius = wp.sqrt(splat.reach) * (1.0 / UNIT)
+    splat.half_width = radius * wp.sqrt(xx)
+    splat.half_height = radius * wp.sqrt(yy)
+    splat.inv_bc = wp.sqrt(determinant / xx) * (1.0 / UNIT)
+    splat.summit = -b * splat.half_height * splat.inv_bc
     x = splat.mean[0]
     y = splat.mean[1]
     inside = x + splat.half_width >= 0.5 and x - splat.half_width <= float(camera.width) - 0.5

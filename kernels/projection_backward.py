@@ -15,6 +15,7 @@ from sgwarp.kernels.gaussian import (
     Pinhole,
     camera_from_world,
     ewa_rows,
+    footprint_factor,
     rotation_from_quaternion,
 )
 from sgwarp.kernels.projection import Knobs
@@ -156,11 +157,7 @@ def project_backward(
     yy = wp.length_sq(m_y)
     determinant = sharp + knobs.dilation * (xx + yy) + knobs.dilation * knobs.dilation
     yy += knobs.dilation
-    unit = wp.sqrt(0.5 * LOG2_E)
-    root = wp.sqrt(determinant)
-    a = unit * wp.sqrt(yy) / root
-    b = -unit * wp.dot(m_x, m_y) / (wp.sqrt(yy) * root)
-    c = unit / wp.sqrt(yy)
+    a, b, c = footprint_factor(wp.dot(m_x, m_y), yy, determinant)
 
     g = LN_2 * sums[i, 0]
     gu = LN_2 * sums[i, 1]
