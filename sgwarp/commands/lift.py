@@ -21,7 +21,14 @@ class Lift(SceneOptions):
     """Semantics file to write, .safetensors; run.json goes beside it."""
 
     encoder: str = "conse"
-    """Where the 2D semantics come from: the name of an encoder, or files:DIR for one file per view."""
+    """Where the 2D semantics come from, such as conse, clip:PATH+sam:PATH or files:DIR; `sgwarp encoders` lists all."""
+
+    cache: str = ""
+    """Folder in which feature maps are kept, so that the same views are encoded once; none for no cache. If not given,
+    where caches belong on this platform ($XDG_CACHE_HOME/sgwarp/maps)."""
+
+    cache_limit: float = 10.0
+    """Size of that folder, at most [gigabytes]: the maps not used for longest go first."""
 
     mode: Literal["weighted", "center"] = "weighted"
     """weighted: all pixels a Gaussian contributes to; center: the pixel of its centre, with a depth test."""
@@ -44,6 +51,7 @@ class Lift(SceneOptions):
     def run(self) -> None:
         check_name("--out", self.out, ".safetensors")
         with self.logged(self.out.parent) as log:
+            from sgwarp.encoders.cache import CachedMaps, default_folder
             from sgwarp.encoders.registry import make_encoder
             from sgwarp.io.store import save_semantics
             from sgwarp.lift import lift
@@ -51,7 +59,8 @@ class Lift(SceneOptions):
             gaussians = self.load_scene(log)
             views = find_views(self.views, photographs=self.photographs)
             with log.stage("load_encoder"):
-                source = make_encoder(self.encoder, views, self.device)
+                folder = None if self.cache == "none" else self.cache or default_folder()
+                source = make_encoder(self.encoder, views, self.device, folder, self.cache_limit)
             with show_progress("lift") as progress:
                 semantics = lift(
                     gaussians,
@@ -65,6 +74,8 @@ class Lift(SceneOptions):
                     progress=progress,
                     log=log,
                 )
+            if isinstance(source, CachedMaps):
+                log.leave_out("views_encoded_before", source.hits)
             notes = {"encoder": self.encoder, "mode": self.mode, "views": len(views)}
             with log.stage("write"):
                 save_semantics(semantics, self.out, notes)
