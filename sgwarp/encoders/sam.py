@@ -97,7 +97,8 @@ class Sam:
             kept.append(self._good(logits, scores, inside))
         logits, scores, ranks = (torch.cat(column) for column in zip(*kept, strict=True))
         masks = self._at_size(logits, inside, image)
-        large = masks.flatten(1).float().mean(dim=1) >= self.settings.smallest
+        areas = masks.flatten(1).sum(dim=1)
+        large = areas >= max(1.0, self.settings.smallest * masks.shape[1] * masks.shape[2])
         found = Masks(masks[large], scores[large], ranks[large])
         return without_repetitions(found, self.settings.overlap, self.settings.by_rank)
 
@@ -142,12 +143,14 @@ class Sam:
         """Masks in the shape of the image, bool [m, h, w], from logits [m, s, s] of the square."""
         longest = min(self.settings.longest, max(image.shape[:2]))
         size = fitted(image.shape[0], image.shape[1], longest, 1)
+        if not len(logits):
+            return torch.zeros(0, *size, dtype=torch.bool)
         masks = []
         for part in logits.split(16):
             square = interpolate(part[None], (self.side, self.side), mode="bilinear", align_corners=False)
             filled = square[:, :, : inside[0], : inside[1]]
             masks.append((interpolate(filled, size, mode="bilinear", align_corners=False)[0] > 0).cpu())
-        return torch.cat(masks) if masks else torch.zeros(0, *size, dtype=torch.bool)
+        return torch.cat(masks)
 
 
 def without_repetitions(masks: Masks, overlap: float, by_rank: bool = False) -> Masks:
