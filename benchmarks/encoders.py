@@ -2,10 +2,10 @@
 
     SGWARP_DATA=FOLDER python benchmarks/encoders.py [room] [time] [cost] [memory] [--out benchmarks/encoders.json]
 
-room: on the full room (see room.py), the default encoder without masks, with OpenCV's proposals, and with the true masks
-as an upper bound: furniture mIoU and localisation on the held-out views. time: seconds per view of the same. cost: time
-and bytes per view of dense maps against id maps at 512 channels. memory: the peak of a process that lifts 100 synthetic
-views of 1080p features. Parts not asked for keep their figures in the file.
+room: on the full room (see room.py), the default encoder without masks, with OpenCV's proposals, and with the true
+masks as an upper bound: furniture mIoU and localisation on the held-out views. time: seconds per view of the same.
+cost: time and bytes per view of dense maps against id maps at 512 channels. memory: the peak of a process that lifts
+100 synthetic views of 1080p features. Parts not asked for keep their figures in the file.
 """
 
 from __future__ import annotations
@@ -18,7 +18,9 @@ import subprocess
 import sys
 import tempfile
 import time
+from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import torch
@@ -44,8 +46,6 @@ SOURCES = {
     "graph segmentation, crops alone": "conse:crops",
     "SLIC superpixels": "conse+slic",
     "graph segmentation, three scales": "conse+graph?scales=100,300,900",
-    "SEEDS superpixels": "conse+seeds",
-    "selective search": "conse+selective",
 }
 
 
@@ -56,14 +56,14 @@ def room_folder() -> Path:
     return Path(data) / "room"
 
 
-def room(cache: Path) -> dict[str, dict[str, float]]:
-    """Furniture mIoU and localisation of each source on the held-out views of the full room."""
+def room(cache: Path, save: Callable[[dict[str, Any]], None]) -> dict[str, Any]:
+    """Furniture mIoU and localisation of each source on the held-out views of the full room; saved one by one."""
     from room import FullRoom, objects_found
 
     folder = room_folder()
     scene = FullRoom.build(folder, COUNT)
-    results = {}
-    for name, encoder in {**SOURCES, TRUE_LABELS: ""}.items():
+    results: dict[str, Any] = {}
+    for name, encoder in {TRUE_LABELS: "", **SOURCES}.items():
         if encoder:
             source = CachedMaps(sg.make_encoder(encoder.format(labels=folder / "labels"), scene.views), cache)
             semantics = sg.lift(scene.gaussians, scene.views, source)
@@ -78,6 +78,7 @@ def room(cache: Path) -> dict[str, dict[str, float]]:
             "IoU": dict(zip(scene.furniture, found.confusion.iou[:FURNITURE].tolist(), strict=True)),
         }
         print(f"{name:36s} mIoU {found.miou:.3f}, {results[name]['sights found']} of {len(found.findings)}", flush=True)
+        save(results)
     return results
 
 
@@ -198,16 +199,20 @@ def main() -> None:
     if options.lift_many:
         lift_many(options.lift_many, options.views)
         return
+    results = json.loads(options.out.read_text()) if options.out.is_file() else {}
+
+    def save(part: str, found: dict[str, Any]) -> None:
+        results[part] = found
+        options.out.write_text(json.dumps(results, indent=1) + "\n")
+
     jobs = {
-        "room": lambda: room(options.cache),
+        "room": lambda: room(options.cache, lambda found: save("room", found)),
         "time": lambda: seconds_per_view(options.rounds),
         "cost": lambda: cost(options.rounds),
         "memory": lambda: memory(options.views),
     }
-    results = json.loads(options.out.read_text()) if options.out.is_file() else {}
     for part in options.parts or jobs:
-        results[part] = jobs[part]()
-        options.out.write_text(json.dumps(results, indent=1) + "\n")
+        save(part, jobs[part]())
     print(f"written to {options.out}")
 
 

@@ -6,7 +6,7 @@ loaded by its path, because importlib mode puts no folder of tests on sys.path.
 
 import importlib.util
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import NamedTuple
 
@@ -48,3 +48,12 @@ def make_scene() -> Callable[[str], NamedScene]:
 def scenes():
     """The module tests/scenes.py itself, for its builders (cloud, pinhole, look_at, changed)."""
     return catalogue
+
+
+@pytest.fixture(scope="session", autouse=True)
+def cache_of_its_own(tmp_path_factory: pytest.TempPathFactory) -> Iterator[None]:
+    """No test reads or writes the maps that the user's own runs keep."""
+    folder = tmp_path_factory.mktemp("maps")
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setenv("SGWARP_CACHE", str(folder))
+        yield

@@ -12,7 +12,6 @@ import hashlib
 import json
 import os
 import sys
-import zipfile
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
@@ -23,6 +22,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from sgwarp.encoders.base import MapSource, TextEncoder
+from sgwarp.encoders.feature_files import load_archive
 from sgwarp.errors import InputError
 from sgwarp.io.atomic import atomic_path
 from sgwarp.scene import FeatureMap, View
@@ -35,7 +35,10 @@ GIGABYTE = 1e9
 
 
 def default_folder() -> Path:
-    """Where caches belong on this platform."""
+    """$SGWARP_CACHE, or where caches belong on this platform."""
+    chosen = os.environ.get("SGWARP_CACHE")
+    if chosen:
+        return Path(chosen)
     if sys.platform == "darwin":
         base = Path.home() / "Library" / "Caches"
     elif sys.platform == "win32":
@@ -180,13 +183,12 @@ def _half(values: Tensor) -> NDArray[Any]:
 
 def _read(path: Path) -> dict[str, NDArray[Any]] | None:
     """Arrays of a stored map, or None if it is not there or damaged (every array has a checksum)."""
-    try:
-        with np.load(path, allow_pickle=False) as content:
-            stored = {name: content[name] for name in content.files}
-        unpack(stored)
-    except FileNotFoundError:
+    if not path.is_file():
         return None
-    except (OSError, ValueError, KeyError, EOFError, zipfile.BadZipFile, TypeError):
+    try:
+        stored = load_archive(path)
+        unpack(stored)
+    except (InputError, KeyError, ValueError, TypeError):
         path.unlink(missing_ok=True)
         return None
     return stored

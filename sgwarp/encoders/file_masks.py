@@ -16,9 +16,10 @@ import torch
 from torch import Tensor
 
 from sgwarp.encoders.base import UNRANKED, Masks
+from sgwarp.encoders.feature_files import load_archive
 from sgwarp.encoders.files import MissingMap
 from sgwarp.errors import InputError
-from sgwarp.io.files import read_bytes, reading
+from sgwarp.io.files import read_bytes
 from sgwarp.io.images import read_ids
 from sgwarp.scene import View
 
@@ -79,14 +80,7 @@ def _from_ids(path: Path) -> Masks:
 
 
 def _from_stack(path: Path) -> Masks:
-    with reading(path):
-        try:
-            with np.load(path, allow_pickle=False) as content:
-                arrays = {name: content[name] for name in content.files}
-        except Exception as error:
-            if isinstance(error, OSError):
-                raise
-            raise InputError(f"{path}: is not an .npz of arrays, or is damaged ({error})") from None
+    arrays = load_archive(path)
     if "masks" not in arrays or arrays["masks"].ndim != 3:
         raise InputError(f"{path}: expected an array masks [M, h, w]")
     count = len(arrays["masks"])

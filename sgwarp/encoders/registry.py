@@ -36,7 +36,7 @@ def make_encoder(
             `sgwarp encoders` lists them all.
         views: The views that will be asked for; needed for files.
         device: Where networks run.
-        cache: Folder in which maps are kept for the next time; None for no cache.
+        cache: Folder in which maps are kept for the next time; None for no cache. What reads no image needs none.
         cache_limit: Size of that folder, at most [gigabytes]; 10 if None.
 
     Raises:
@@ -47,7 +47,7 @@ def make_encoder(
     members = parse(name)
     sources = [_make_member(member, views, device, name) for member in members]
     source = sources[0] if len(sources) == 1 else Ensemble(sources, [member.weight for member in members])
-    if cache is None:
+    if cache is None or not source.needs_image:  # files are quick to read
         return source
     from sgwarp.encoders.cache import DEFAULT_LIMIT, CachedMaps
 
@@ -176,7 +176,9 @@ def _make_conse(member: Member, device: Device, whole: str) -> MapSource:
 
 def _make_maps(part: Part, views: Sequence[View], device: Device) -> MapSource:
     if part.kind.name == "files":
-        return open_files(part.name.partition(":")[2], views)
+        return open_files(part.argument, views, **part.options)
+    if part.kind.name == "openscene":
+        raise InputError(f"{part.name}: holds features per Gaussian, not per view; read it with sg.load_openscene")
     if part.kind.name == "deva":
         from sgwarp.encoders.deva import DevaMaps
 

@@ -22,8 +22,10 @@ import torch
 from numpy.typing import NDArray
 
 from sgwarp.encoders.base import Instances
+from sgwarp.encoders.feature_files import load_archive
+from sgwarp.encoders.files import MissingMap
 from sgwarp.errors import InputError
-from sgwarp.io.files import read_bytes, reading
+from sgwarp.io.files import read_bytes
 from sgwarp.scene import View
 
 SUFFIXES = (".json", ".npz")
@@ -50,7 +52,7 @@ class VLPartFiles:
     def _path(self, view: View) -> Path:
         found = [path for path in (self.folder / f"{view.stem}{suffix}" for suffix in SUFFIXES) if path.is_file()]
         if not found:
-            raise InputError(f"{self.folder}: holds no {view.stem}.json or {view.stem}.npz")
+            raise MissingMap(f"{self.folder}: holds no {view.stem}.json or {view.stem}.npz")
         return found[0]
 
     def has_map(self, view: View) -> bool:
@@ -92,7 +94,7 @@ def _read_json(path: Path) -> Instances:
     if not isinstance(rows, list):
         raise InputError(f'{path}: expected {{"instances": [...]}}')
     try:
-        boxes = [[float(value) for value in row["box"]] for row in rows]
+        boxes = [[float(row["box"][side]) for side in range(4)] for row in rows]
         names = [str(row["name"]) for row in rows]
         scores = [float(row["score"]) for row in rows]
         masks = [decode_rle(row["mask"]) for row in rows if row.get("mask") is not None]
@@ -105,21 +107,17 @@ def _read_json(path: Path) -> Instances:
 
 
 def _read_npz(path: Path) -> Instances:
-    with reading(path):
-        try:
-            with np.load(path, allow_pickle=False) as content:
-                arrays = {name: content[name] for name in content.files}
-            boxes = torch.from_numpy(arrays["boxes"].astype(np.float32))
-            names = [str(name) for name in arrays["names"]]
-            scores = [float(score) for score in arrays["scores"]]
-            masks = torch.from_numpy(arrays["masks"].astype(bool)) if "masks" in arrays else None
-        except KeyError as error:
-            raise InputError(f"{path}: lacks the array {error.args[0]}") from None
-        except Exception as error:
-            if isinstance(error, OSError):
-                raise
-            raise InputError(f"{path}: is not an .npz of arrays, or is damaged ({error})") from None
-    return _checked(path, boxes, names, scores, masks)
+    arrays = load_archive(path)
+    missing = [name for name in ("boxes", "names", "scores") if name not in arrays]
+    if missing:
+        raise InputError(f"{path}: lacks the array {missing[0]}")
+    try:
+        boxes = torch.from_numpy(arrays["boxes"].astype(np.float32)).reshape(-1, 4)
+        scores = [float(score) for score in arrays["scores"]]
+    except (ValueError, TypeError, RuntimeError) as error:
+        raise InputError(f"{path}: boxes [K, 4] and scores [K] must be numbers ({error})") from None
+    masks = torch.from_numpy(arrays["masks"].astype(bool)) if "masks" in arrays else None
+    return _checked(path, boxes, [str(name) for name in arrays["names"]], scores, masks)
 
 
 def _checked(

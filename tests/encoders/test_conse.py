@@ -28,7 +28,6 @@ def by_region(settings: ConseSettings = SMALL, proposals: Proposals = FINE) -> M
     return MaskedImages(Conse(settings), proposals)
 
 
-
 @pytest.fixture(scope="module", autouse=True)
 def installed():
     for package in PACKAGES:

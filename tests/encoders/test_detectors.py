@@ -205,9 +205,7 @@ def test_clipseg(clipseg, tools, image):
     tokens = torch.tensor([[101, 200, 102, 0], [101, 210, 211, 102]])
     model = CLIPSegForImageSegmentation.from_pretrained(clipseg).eval()
     with torch.no_grad():
-        answer = model(
-            input_ids=tokens, attention_mask=(tokens > 0).long(), pixel_values=values.expand(2, -1, -1, -1)
-        )
+        answer = model(input_ids=tokens, attention_mask=(tokens > 0).long(), pixel_values=values.expand(2, -1, -1, -1))
     torch.testing.assert_close(found, answer.logits.sigmoid().permute(1, 2, 0), rtol=1e-3, atol=1e-5)
     assert not torch.allclose(found[..., 0], found[..., 1])
     with pytest.raises(InputError, match="needs the phrases to look for"):

@@ -63,8 +63,15 @@ def published_names() -> dict[str, tuple[int, ...]]:
     }
     for k in range(2):
         block = f"transformer.resblocks.{k}."
-        clip |= {f"{block}attn.in_proj_weight": (3 * TEXT_WIDTH, TEXT_WIDTH), f"{block}attn.in_proj_bias": (3 * TEXT_WIDTH,)}
-        sizes = {"attn.out_proj": (TEXT_WIDTH, TEXT_WIDTH), "mlp.c_fc": (96, TEXT_WIDTH), "mlp.c_proj": (TEXT_WIDTH, 96)}
+        clip |= {
+            f"{block}attn.in_proj_weight": (3 * TEXT_WIDTH, TEXT_WIDTH),
+            f"{block}attn.in_proj_bias": (3 * TEXT_WIDTH,),
+        }
+        sizes = {
+            "attn.out_proj": (TEXT_WIDTH, TEXT_WIDTH),
+            "mlp.c_fc": (96, TEXT_WIDTH),
+            "mlp.c_proj": (TEXT_WIDTH, 96),
+        }
         for name, size in sizes.items():
             clip |= {f"{block}{name}.weight": size, f"{block}{name}.bias": size[:1]}
         for name in ("ln_1", "ln_2"):
@@ -151,7 +158,11 @@ def test_transformer_against_plain_formulas(checkpoint, weights):
         torch.testing.assert_close(one[0], other, rtol=1e-9, atol=1e-9)
     assert [list(one.shape[1:]) for one in maps] == [[8, 8, 24], [12, 4, 12], [16, 2, 6], [20, 1, 3]]
     # The third map has no resizing: the class token projected in, and a 1 x 1 convolution.
-    c = {k.removeprefix("act_postprocess3."): v.double() for k, v in weights.items() for k in [k.removeprefix("pretrained.")]}
+    c = {
+        k.removeprefix("act_postprocess3."): v.double()
+        for k, v in weights.items()
+        for k in [k.removeprefix("pretrained.")]
+    }
     joint = torch.cat([read[2][1:], read[2][:1].expand(12, -1)], dim=1)
     h = joint @ c["0.project.0.weight"].T + c["0.project.0.bias"]
     h = h * 0.5 * (1 + torch.erf(h / math.sqrt(2)))
@@ -214,7 +225,13 @@ def test_phrases_by_the_checkpoints_own_text_tower(checkpoint, weights, tokenize
             b = {n.removeprefix(f"transformer.resblocks.{k}."): v for n, v in w.items()}
             h = layer_norm(x, b["ln_1.weight"], b["ln_1.bias"], 1e-5)
             x = x + attention(
-                h, b["attn.in_proj_weight"], b["attn.in_proj_bias"], b["attn.out_proj.weight"], b["attn.out_proj.bias"], 1, mask
+                h,
+                b["attn.in_proj_weight"],
+                b["attn.in_proj_bias"],
+                b["attn.out_proj.weight"],
+                b["attn.out_proj.bias"],
+                1,
+                mask,
             )
             h = layer_norm(x, b["ln_2.weight"], b["ln_2.bias"], 1e-5) @ b["mlp.c_fc.weight"].T + b["mlp.c_fc.bias"]
             x = x + (h * torch.sigmoid(1.702 * h)) @ b["mlp.c_proj.weight"].T + b["mlp.c_proj.bias"]

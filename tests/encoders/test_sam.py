@@ -80,7 +80,9 @@ def test_everything_asks_at_a_grid_of_points(sam_models, kind, image, tools, mon
 
 
 def test_masks_no_larger_than_asked(sam_models, tools):
-    sam = Sam(str(sam_models["sam"]), SamSettings(points=1, least_score=-100.0, least_stability=0.0, offset=0.0, longest=20))
+    sam = Sam(
+        str(sam_models["sam"]), SamSettings(points=1, least_score=-100.0, least_stability=0.0, offset=0.0, longest=20)
+    )
     assert sam.everything(tools.make_view(48, 80), torch.rand(48, 80, 3)).masks.shape[1:] == (12, 20)
 
 
