@@ -15,6 +15,7 @@ if TYPE_CHECKING:
     from sgwarp.encoders.registry import text_encoder_for as text_encoder_for
     from sgwarp.errors import InputError as InputError
     from sgwarp.from_depth import gaussians_from_depth as gaussians_from_depth
+    from sgwarp.io.openscene import load_openscene as load_openscene
     from sgwarp.io.scenes import load_gaussians as load_gaussians
     from sgwarp.io.scenes import save_gaussians as save_gaussians
     from sgwarp.io.store import load_semantics as load_semantics
@@ -52,6 +53,7 @@ _HOME = {
     "gaussians_from_depth": "sgwarp.from_depth",
     "lift": "sgwarp.lift",
     "load_gaussians": "sgwarp.io.scenes",
+    "load_openscene": "sgwarp.io.openscene",
     "load_semantics": "sgwarp.io.store",
     "load_views": "sgwarp.io.views",
     "localize": "sgwarp.segment",

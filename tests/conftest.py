@@ -6,7 +6,7 @@ tests/differences.py, is loaded by its path, because importlib mode puts no fold
 
 import importlib.util
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import NamedTuple
 
@@ -55,3 +55,12 @@ def scenes():
 def assert_central_differences():
     """Compare gradients with central differences of a float64 loss."""
     return differences.assert_central_differences
+
+
+@pytest.fixture(scope="session", autouse=True)
+def cache_of_its_own(tmp_path_factory: pytest.TempPathFactory) -> Iterator[None]:
+    """No test reads or writes the maps that the user's own runs keep."""
+    folder = tmp_path_factory.mktemp("maps")
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setenv("SGWARP_CACHE", str(folder))
+        yield

@@ -4,6 +4,7 @@ Only `sgwarp.cli` imports this package, once tyro is known to be there; torch an
 """
 
 from sgwarp.commands.demo import Demo
+from sgwarp.commands.encoders import Encoders
 from sgwarp.commands.info import Info
 from sgwarp.commands.lift import Lift
 from sgwarp.commands.query import Query
@@ -17,6 +18,7 @@ COMMANDS = {
     "segment": Segment,
     "render": Render,
     "info": Info,
+    "encoders": Encoders,
     "report": Report,
     "demo": Demo,
 }

@@ -34,7 +34,10 @@ class Query(SemanticsOptions):
     """Mask to write, .png, 255 on what was found and 0 elsewhere; the heat map {out}_heat.png goes beside it."""
 
     score: Literal["cosine", "relevancy"] = "cosine"
-    """relevancy: how much better the text fits than "object", "things", "stuff" and "texture"."""
+    """relevancy: how much better the text fits than any of --canonical."""
+
+    canonical: tuple[str, ...] = ("object", "things", "stuff", "texture")
+    """What the text has to beat with --score relevancy."""
 
     threshold: float = 0.5
     """Least score of a pixel of the mask, where 0 is the scene's median score and 1 its best thousandth."""
@@ -71,13 +74,15 @@ class Query(SemanticsOptions):
 
     def _scores(self, semantics: Semantics, log: RunLog) -> Tensor:
         """Score of every Gaussian on the scale of the mask, [N]."""
-        from sgwarp.encoders.registry import text_encoder_for
         from sgwarp.query import class_votes, evidence, query, relevancy, rescale
 
         if semantics.labels is not None:
             return class_votes(semantics, [self.text])[:, 0]
         with log.stage("load_encoder"):
-            encoder = text_encoder_for(semantics.space)
+            encoder = self.text_encoder(semantics)
         with log.stage("query"):
-            score = query if self.score == "cosine" else relevancy
-            return rescale(evidence(score(semantics, [self.text], encoder), semantics), semantics.seen)[:, 0]
+            if self.score == "cosine":
+                scores = query(semantics, [self.text], encoder)
+            else:
+                scores = relevancy(semantics, [self.text], encoder, self.canonical)
+            return rescale(evidence(scores, semantics), semantics.seen)[:, 0]
