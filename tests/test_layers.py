@@ -30,6 +30,7 @@ ORDER = (
     "pictures",
     "render",
     "orbit",
+    "fit",
     "residual",
     "lift",
     "query",
