@@ -184,7 +184,9 @@ def gather_gradient(
         for j in range(FLOATS):
             d = x[j] - y[j]
             difference[j] = difference[j] + wp.abs(d)
-            chain[j] = by_similarity * chain[j] + by_difference * (wp.where(d > 0.0, 1.0, 0.0) - wp.where(d < 0.0, 1.0, 0.0))
+            chain[j] = by_similarity * chain[j] + by_difference * (
+                wp.where(d > 0.0, 1.0, 0.0) - wp.where(d < 0.0, 1.0, 0.0)
+            )
         for j in range(wp.min(FLOATS, floats - column * FLOATS)):
             gradient_out[row, column * FLOATS + j] = chain[j]
     total = float(0.0)

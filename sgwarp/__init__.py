@@ -15,7 +15,7 @@ if TYPE_CHECKING:
     from sgwarp.encoders.registry import text_encoder_for as text_encoder_for
     from sgwarp.errors import InputError as InputError
     from sgwarp.fit import fit as fit
-    from sgwarp.fit.settings import FitSettings as FitSettings
+    from sgwarp.fitting.settings import FitSettings as FitSettings
     from sgwarp.from_depth import gaussians_from_depth as gaussians_from_depth
     from sgwarp.io.points import load_points as load_points
     from sgwarp.io.scenes import load_gaussians as load_gaussians
@@ -44,7 +44,7 @@ if TYPE_CHECKING:
 _HOME = {
     "Camera": "sgwarp.scene",
     "FeatureMap": "sgwarp.scene",
-    "FitSettings": "sgwarp.fit.settings",
+    "FitSettings": "sgwarp.fitting.settings",
     "Gaussians": "sgwarp.scene",
     "InputError": "sgwarp.errors",
     "RasterSettings": "sgwarp.ops.settings",

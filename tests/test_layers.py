@@ -30,6 +30,7 @@ ORDER = (
     "pictures",
     "render",
     "orbit",
+    "fitting",
     "fit",
     "residual",
     "lift",

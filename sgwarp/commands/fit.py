@@ -14,8 +14,8 @@ from sgwarp.errors import InputError
 from sgwarp.progress import show_progress
 
 if TYPE_CHECKING:
-    from sgwarp.fit.settings import FitSettings
-    from sgwarp.fit.training import Fitted
+    from sgwarp.fit import Fitted
+    from sgwarp.fitting.settings import FitSettings
     from sgwarp.runlog import RunLog
     from sgwarp.scene import View
 
@@ -87,9 +87,9 @@ class Fit(Options):
         if self.hold_out < 0:
             raise InputError(f"--hold-out: expected 0 or more, got {self.hold_out}")
         with self.logged(self.out.parent) as log:
-            from sgwarp.fit.photographs import masks_from_folder, require_enough
-            from sgwarp.fit.settings import FitSettings
-            from sgwarp.fit.training import fit
+            from sgwarp.fit import fit
+            from sgwarp.fitting.photographs import masks_from_folder, require_enough
+            from sgwarp.fitting.settings import FitSettings
 
             views = find_views(self.views)
             held_out = views[:: self.hold_out] if self.hold_out else []
@@ -141,15 +141,15 @@ class Fit(Options):
         with log.stage("start"):
             if init == "points":
                 return load_points(self.points or self.views)
-            from sgwarp.fit.initial import depth_from_folder
+            from sgwarp.fitting.initial import depth_from_folder
             from sgwarp.from_depth import gaussians_from_depth
 
             assert self.depth is not None
             return gaussians_from_depth(views, depth_from_folder(self.depth), count=settings.cap)
 
     def _write(self, fitted: Fitted, held_out: list[View], log: RunLog) -> None:
-        from sgwarp.fit.photographs import read_photographs
-        from sgwarp.fit.report import draw_curve, write_contact_sheet
+        from sgwarp.fitting.photographs import read_photographs
+        from sgwarp.fitting.report import draw_curve, write_contact_sheet
         from sgwarp.io.scenes import save_gaussians
 
         last = fitted.curve[-1]
@@ -172,7 +172,7 @@ class Fit(Options):
 
 
 def _has_matplotlib() -> bool:
-    from sgwarp.fit.report import require_matplotlib
+    from sgwarp.fitting.report import require_matplotlib
 
     try:
         require_matplotlib()

@@ -95,7 +95,7 @@ class _Planes:
         planes[:, :, : kernels.MARGIN * LANES] = 0.0
         planes[:, :, stride - kernels.MARGIN * LANES :] = 0.0
         self.vectors = view(planes.view(count, height, -1, LANES), Lanes)
-        self.shifted = wp.array(
+        self.shifted: Any = wp.array(
             ptr=memory.data_ptr(),
             dtype=Lanes,
             shape=(count, height, stride - LANES + 1),

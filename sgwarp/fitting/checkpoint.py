@@ -14,8 +14,8 @@ import torch
 from torch import Tensor
 
 from sgwarp.errors import InputError
-from sgwarp.fit.photographs import Photograph
-from sgwarp.fit.settings import FitSettings
+from sgwarp.fitting.photographs import Photograph
+from sgwarp.fitting.settings import FitSettings
 from sgwarp.io.atomic import atomic_path
 from sgwarp.io.files import reading
 

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from sgwarp.fit.settings import FitSettings
+from sgwarp.fitting.settings import FitSettings
 from sgwarp.ops.adam import Group, count_steps, update, values_of
 from sgwarp.scene import SH_COUNTS, Gaussians
 
@@ -107,7 +107,7 @@ class Model:
             group.values = group.parameters if group.form == "plain" else group.values[rows]
         self.steps = self.steps[rows]
 
-    def append(self, rows: Tensor, changed: Mapping[str, Tensor] = {}) -> None:  # noqa: B006 - never written to
+    def append(self, rows: Tensor, changed: Mapping[str, Tensor] = {}) -> None:
         """Copies of these rows, with other parameters where given; they have taken no step."""
         for name, group in self.groups.items():
             new = changed.get(name, group.parameters[rows])

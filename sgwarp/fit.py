@@ -14,14 +14,16 @@ import torch
 from torch import Tensor
 
 from sgwarp.errors import InputError
-from sgwarp.fit.checkpoint import Checkpoint, fingerprint
-from sgwarp.fit.densify import Densify
-from sgwarp.fit.exposure import Exposure
-from sgwarp.fit.initial import adapted, gaussians_from_points, random_points
-from sgwarp.fit.interrupt import deferred_interrupt
-from sgwarp.fit.mcmc import MarkovChain
-from sgwarp.fit.model import Gradients, Model
-from sgwarp.fit.photographs import (
+from sgwarp.fitting.checkpoint import Checkpoint, fingerprint
+from sgwarp.fitting.densify import Densify
+from sgwarp.fitting.exposure import Exposure
+from sgwarp.fitting.initial import adapted, gaussians_from_points, random_points
+from sgwarp.fitting.interrupt import deferred_interrupt
+from sgwarp.fitting.mcmc import MarkovChain
+from sgwarp.fitting.measurement import Measurement as Measurement
+from sgwarp.fitting.measurement import psnr
+from sgwarp.fitting.model import Gradients, Model
+from sgwarp.fitting.photographs import (
     Masks,
     Photograph,
     camera_extent,
@@ -29,8 +31,8 @@ from sgwarp.fit.photographs import (
     require_enough,
     require_overlap,
 )
-from sgwarp.fit.seeds import generator, view_at
-from sgwarp.fit.settings import FitSettings
+from sgwarp.fitting.seeds import generator, view_at
+from sgwarp.fitting.settings import FitSettings
 from sgwarp.ops.differentiable import rasterize_differentiable
 from sgwarp.ops.photometric import photometric_loss
 from sgwarp.ops.rasterize import rasterize
@@ -40,25 +42,6 @@ from sgwarp.scene import Gaussians, View
 
 REPORT_EVERY = 10  # steps between two reports of the progress
 MEMORY = 0.99  # of the loss that is reported
-
-
-@dataclass(frozen=True)
-class Measurement:
-    """Where a run stood.
-
-    Attributes:
-        step: Steps taken.
-        seconds: Spent on them, without reading and measuring.
-        psnr: Mean over the held-out views [dB], NaN without any.
-        loss: Running mean of the loss.
-        count: Gaussians.
-    """
-
-    step: int
-    seconds: float
-    psnr: float
-    loss: float
-    count: int
 
 
 @dataclass(frozen=True, eq=False)
@@ -154,8 +137,8 @@ def _starting(
     if isinstance(start, Gaussians):
         gaussians = adapted(start, settings).to(device)
     else:
-        points = random_points(photographs, views, settings) if start is None else start
-        gaussians = gaussians_from_points(*points, settings, extent, device)
+        positions, colours = random_points(photographs, views, settings) if start is None else start
+        gaussians = gaussians_from_points(positions, colours, settings, extent, device)
     if start is not None:
         require_overlap(views, gaussians.means)
     return gaussians
@@ -323,9 +306,3 @@ class _Run:
         self.step, self.seconds = saved.step, saved.seconds
         (self.loss, self.psnr), *points = saved.curve
         self.curve = [Measurement(*point) for point in points]  # type: ignore[arg-type]
-
-
-def psnr(image: Tensor, truth: Tensor) -> float:
-    """Peak signal-to-noise ratio of an image, clipped to [0, 1], against the truth [dB]."""
-    error = float((image.clamp(0.0, 1.0) - truth).square().mean())
-    return math.inf if error == 0.0 else -10.0 * math.log10(error)

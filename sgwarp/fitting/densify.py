@@ -7,15 +7,16 @@ from collections.abc import Mapping
 import torch
 from torch import Tensor
 
-from sgwarp.fit.model import Gradients, Model
-from sgwarp.fit.seeds import generator
-from sgwarp.fit.settings import FitSettings
+from sgwarp.fitting.model import Gradients, Model
+from sgwarp.fitting.seeds import generator
+from sgwarp.fitting.settings import FitSettings
 from sgwarp.ops.adam import note_gradients
 from sgwarp.ops.reference import rotation_matrices
 from sgwarp.scene import Camera
 
 REFINE_UNTIL = 15_000  # of the reference's steps
 RESET_EVERY = 3_000
+LEAST_RESET = 1_000  # steps between two resets, however short the run: opacities need some hundred to recover
 CHILDREN = 2  # of a Gaussian that is split
 SHRINK = 0.8 * CHILDREN  # of their scales
 HUGE = 0.1  # scale beyond which a Gaussian is removed once opacities have been reset [extent]
@@ -43,7 +44,7 @@ class Densify:
             return
         assert gradients.means2d is not None
         note_gradients(gradients.means2d, taken, camera.width, camera.height, self.sums, self.views)
-        reset_every = max(1, settings.scaled(RESET_EVERY))
+        reset_every = max(LEAST_RESET, settings.scaled(RESET_EVERY))
         if settings.refines_at(step, REFINE_UNTIL):
             self._grow(model, step)
             self._prune(model, remove_huge=step > reset_every)
@@ -81,7 +82,7 @@ class Densify:
         kept = model["opacities"] >= self.settings.least_opacity
         if remove_huge:
             kept &= model["scales"].amax(dim=1) <= HUGE * self.extent
-        if not bool(kept.all()):
+        if bool(kept.any()):
             model.keep(kept)
 
     def state(self) -> dict[str, Tensor]:

@@ -11,9 +11,9 @@ import torch
 from torch import Tensor
 
 from sgwarp.errors import InputError
-from sgwarp.fit.photographs import Photograph, camera_extent
-from sgwarp.fit.seeds import generator
-from sgwarp.fit.settings import FitSettings
+from sgwarp.fitting.photographs import Photograph, camera_extent
+from sgwarp.fitting.seeds import generator
+from sgwarp.fitting.settings import FitSettings
 from sgwarp.io.images import read_ids
 from sgwarp.ops.neighbors import mean_squared_neighbor_distance
 from sgwarp.scene import Gaussians, View

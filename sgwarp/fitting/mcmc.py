@@ -7,9 +7,9 @@ from collections.abc import Mapping
 import torch
 from torch import Tensor
 
-from sgwarp.fit.model import Gradients, Model
-from sgwarp.fit.seeds import generator, number
-from sgwarp.fit.settings import FitSettings
+from sgwarp.fitting.model import Gradients, Model
+from sgwarp.fitting.seeds import generator, number
+from sgwarp.fitting.settings import FitSettings
 from sgwarp.ops.adam import add_noise
 from sgwarp.scene import Camera
 

@@ -8,8 +8,8 @@ from pathlib import Path
 import numpy as np
 
 from sgwarp.errors import InputError
-from sgwarp.fit.photographs import Photograph
-from sgwarp.fit.training import Measurement, psnr
+from sgwarp.fitting.measurement import Measurement, psnr
+from sgwarp.fitting.photographs import Photograph
 from sgwarp.io.atomic import atomic_path
 from sgwarp.io.images import write_rgb
 from sgwarp.ops.rasterize import rasterize
@@ -56,12 +56,12 @@ def _row(gaussians: Gaussians, photograph: Photograph, white: bool) -> Picture:
         f"difference, 0 to {LARGEST_ERROR:g} and more",
     )
     height = max(1, round(TILE_WIDTH * photograph.camera.height / photograph.camera.width))
-    tiles = []
+    tiles: list[Picture] = []
     for title, picture in zip(titles, (to_picture(truth), to_picture(image), colours), strict=True):
         tile = cv2.resize(np.ascontiguousarray(picture), (TILE_WIDTH, height), interpolation=cv2.INTER_AREA)
         for colour, thickness in (((0, 0, 0), 3), ((255, 255, 255), 1)):
             cv2.putText(tile, title, (8, 18), cv2.FONT_HERSHEY_SIMPLEX, 0.45, colour, thickness, cv2.LINE_AA)
-        tiles.append(np.pad(tile, ((0, 0), (0, GAP), (0, 0)), constant_values=255))
+        tiles.append(np.pad(tile, ((0, 0), (0, GAP), (0, 0)), constant_values=255).astype(np.uint8))
     return np.concatenate(tiles, axis=1)[:, :-GAP]
 
 
