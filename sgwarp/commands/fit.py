@@ -19,6 +19,8 @@ if TYPE_CHECKING:
     from sgwarp.runlog import RunLog
     from sgwarp.scene import View
 
+EVALUATE_EVERY = 500  # steps between two measurements, less in short runs
+
 
 @dataclass(kw_only=True)
 class Fit(Options):
@@ -104,6 +106,7 @@ class Fit(Options):
                 exposure=self.exposure,
                 sparse=self.sparse,
                 seed=self.seed,
+                evaluate_every=min(EVALUATE_EVERY, max(1, self.steps // 10)),
             )
             masks = masks_from_folder(self.masks, kept) if self.masks is not None else None
             start = self._start(kept, settings, log)

@@ -37,6 +37,8 @@ def load_points(path: str | os.PathLike[str]) -> Points:
     Raises:
         InputError: There is no such file, or it holds no points.
     """
+    if not Path(path).exists():
+        raise InputError(f"{path}: no such file or folder; check the path")
     source = find_points(path)
     if source is None:
         raise InputError(
