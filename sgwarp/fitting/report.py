@@ -18,6 +18,7 @@ from sgwarp.scene import Gaussians
 
 MOST_ROWS = 8
 TILE_WIDTH = 400  # [pixels]
+LETTERS = 0.45  # size of the titles
 GAP = 6  # between pictures [pixels]
 LARGEST_ERROR = 0.25  # mean difference of the channels that is drawn in the strongest colour
 INK, ACCENT = "#222222", "#2d6cb5"
@@ -59,8 +60,9 @@ def _row(gaussians: Gaussians, photograph: Photograph, white: bool) -> Picture:
     tiles: list[Picture] = []
     for title, picture in zip(titles, (to_picture(truth), to_picture(image), colours), strict=True):
         tile = cv2.resize(np.ascontiguousarray(picture), (TILE_WIDTH, height), interpolation=cv2.INTER_AREA)
-        for colour, thickness in (((0, 0, 0), 3), ((255, 255, 255), 1)):
-            cv2.putText(tile, title, (8, 18), cv2.FONT_HERSHEY_SIMPLEX, 0.45, colour, thickness, cv2.LINE_AA)
+        (width, _), _ = cv2.getTextSize(title, cv2.FONT_HERSHEY_SIMPLEX, LETTERS, 1)
+        cv2.rectangle(tile, (0, 0), (width + 16, 24), (0, 0, 0), -1)
+        cv2.putText(tile, title, (8, 17), cv2.FONT_HERSHEY_SIMPLEX, LETTERS, (255, 255, 255), 1, cv2.LINE_AA)
         tiles.append(np.pad(tile, ((0, 0), (0, GAP), (0, 0)), constant_values=255).astype(np.uint8))
     return np.concatenate(tiles, axis=1)[:, :-GAP]
 
