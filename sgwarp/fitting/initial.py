@@ -14,11 +14,11 @@ from sgwarp.errors import InputError
 from sgwarp.fitting.photographs import Photograph, camera_extent
 from sgwarp.fitting.seeds import generator
 from sgwarp.fitting.settings import FitSettings
+from sgwarp.from_depth import SH_C0
 from sgwarp.io.images import read_ids
 from sgwarp.ops.neighbors import mean_squared_neighbor_distance
 from sgwarp.scene import Gaussians, View
 
-SH_C0 = 0.28209479177387814  # constant of SH degree 0: colour = SH_C0 c + 0.5
 OPACITY = {"default": 0.1, "mcmc": 0.5}  # of the reference implementations
 SIZE = 1.0  # in root mean square distances to the three nearest others
 LEAST_DISTANCE = 1e-4  # [extent of the cameras], for points in the same place
