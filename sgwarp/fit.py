@@ -213,7 +213,6 @@ class _Run:
         camera = photograph.camera
         model.raise_degree(settings.degree_at(self.step))
         leaves = {name: model[name].detach().requires_grad_() for name in model.groups}
-        # What is stored of the opacities ends below 1, but a rounded sigmoid does not.
         centres = torch.zeros(len(model), 2, device=self.device, requires_grad=self.strategy.wants_means2d)
         image = rasterize_differentiable(
             leaves["means"],
@@ -239,8 +238,6 @@ class _Run:
             image = torch.where(photograph.mask[..., None], image, truth)  # no difference, and no gradient
         loss = photometric_loss(image, truth, settings.similarity_share)
         loss.backward()
-        if any(leaf.grad is None for leaf in leaves.values()):  # a background alone has none
-            return self._finish(float(loss.detach()), image, truth)
         grads = {name: leaf.grad for name, leaf in leaves.items()}
         gradients = Gradients(**grads, means2d=centres.grad)  # type: ignore[arg-type]
         share = self.step / settings.steps
@@ -249,10 +246,8 @@ class _Run:
             self.exposure.update(index, colour_map.grad, share)
         self.log.leave_out("updates_of_unseen_gaussians", len(model) - int(taken.sum()))
         self.strategy.after_step(model, self.step + 1, gradients, taken, camera)
-        return self._finish(float(loss.detach()), image, truth)
-
-    def _finish(self, loss: float, image: Tensor, truth: Tensor) -> None:
-        self.loss = loss if math.isnan(self.loss) else MEMORY * self.loss + (1 - MEMORY) * loss
+        value = float(loss.detach())
+        self.loss = value if math.isnan(self.loss) else MEMORY * self.loss + (1 - MEMORY) * value
         self.step += 1
         if self.step % REPORT_EVERY == 0:
             self.psnr = psnr(image.detach(), truth)
@@ -274,7 +269,8 @@ class _Run:
                 image = rasterize(gaussians, photograph.camera, background=background).features
                 values[photograph.stem] = psnr(image, photograph.image())
         mean = sum(values.values()) / len(values) if values else math.nan
-        self.curve.append(Measurement(self.step, self.seconds, mean, self.loss, len(gaussians)))
+        if not self.curve or self.curve[-1].step != self.step:
+            self.curve.append(Measurement(self.step, self.seconds, mean, self.loss, len(gaussians)))
         return values
 
     def _text(self, rate: float) -> str:
