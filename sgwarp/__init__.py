@@ -14,8 +14,11 @@ if TYPE_CHECKING:
     from sgwarp.encoders.registry import make_encoder as make_encoder
     from sgwarp.encoders.registry import text_encoder_for as text_encoder_for
     from sgwarp.errors import InputError as InputError
+    from sgwarp.fit import fit as fit
+    from sgwarp.fitting.settings import FitSettings as FitSettings
     from sgwarp.from_depth import gaussians_from_depth as gaussians_from_depth
     from sgwarp.io.openscene import load_openscene as load_openscene
+    from sgwarp.io.points import load_points as load_points
     from sgwarp.io.scenes import load_gaussians as load_gaussians
     from sgwarp.io.scenes import save_gaussians as save_gaussians
     from sgwarp.io.store import load_semantics as load_semantics
@@ -43,6 +46,7 @@ if TYPE_CHECKING:
 _HOME = {
     "Camera": "sgwarp.scene",
     "FeatureMap": "sgwarp.scene",
+    "FitSettings": "sgwarp.fitting.settings",
     "Gaussians": "sgwarp.scene",
     "InputError": "sgwarp.errors",
     "RasterSettings": "sgwarp.ops.settings",
@@ -50,10 +54,12 @@ _HOME = {
     "Semantics": "sgwarp.scene",
     "View": "sgwarp.scene",
     "evidence": "sgwarp.query",
+    "fit": "sgwarp.fit",
     "gaussians_from_depth": "sgwarp.from_depth",
     "lift": "sgwarp.lift",
     "load_gaussians": "sgwarp.io.scenes",
     "load_openscene": "sgwarp.io.openscene",
+    "load_points": "sgwarp.io.points",
     "load_semantics": "sgwarp.io.store",
     "load_views": "sgwarp.io.views",
     "localize": "sgwarp.segment",

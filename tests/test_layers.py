@@ -30,6 +30,8 @@ ORDER = (
     "pictures",
     "render",
     "orbit",
+    "fitting",
+    "fit",
     "residual",
     "lift",
     "query",

@@ -1,5 +1,6 @@
 """Every notebook runs from top to bottom without a warning, and what it finds on the way is right."""
 
+import json
 import runpy
 from pathlib import Path
 
@@ -9,6 +10,7 @@ import nbformat
 import pytest
 import warp as wp
 
+from sgwarp.io.images import read_ids
 from sgwarp.ops import launch  # noqa: F401 - starts Warp quietly
 
 FOLDER = Path(__file__).resolve().parents[1] / "notebooks"
@@ -98,3 +100,21 @@ def test_swap_in(run):
         losses = found["losses"][name]
         assert losses[-12:].mean() < 0.2 * losses[:12].mean()
         assert found["quality"][name] > 21
+
+
+def test_fit_and_ask(run, capsys):
+    found, figures = run("03_fit_and_ask.py")
+    assert figures == 4
+    assert "of the Gaussians were seen" in capsys.readouterr().out
+
+    curve = [point.psnr for point in found["fitted"].curve]
+    assert curve[-1] > 22
+    assert curve[-1] > curve[0] + 3
+    small, middle, large = (found["quality"][cap].psnr for cap in found["caps"])
+    assert small < middle < large
+    assert found["semantics"].coverage > 0.95
+    # The piano stands on the right of the first held-out view.
+    truth = read_ids(found["ROOM"] / "held_out" / "labels" / f"{found['view'].stem}.png")
+    names = json.loads((found["ROOM"] / "classes.json").read_text())
+    x, y = found["hits"]["piano"]
+    assert names[str(truth[y, x])] == "piano"

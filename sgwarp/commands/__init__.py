@@ -5,6 +5,7 @@ Only `sgwarp.cli` imports this package, once tyro is known to be there; torch an
 
 from sgwarp.commands.demo import Demo
 from sgwarp.commands.encoders import Encoders
+from sgwarp.commands.fit import Fit
 from sgwarp.commands.info import Info
 from sgwarp.commands.lift import Lift
 from sgwarp.commands.query import Query
@@ -13,6 +14,7 @@ from sgwarp.commands.report import Report
 from sgwarp.commands.segment import Segment
 
 COMMANDS = {
+    "fit": Fit,
     "lift": Lift,
     "query": Query,
     "segment": Segment,
