@@ -24,7 +24,7 @@ def compositing(count: int, cores: int, rounds: int) -> dict[str, float]:
     arrays = (packed.mean2d, packed.conic, packed.opacity, packed.color, packed.offsets, packed.ids, *camera.size[::-1])
     projected = tiles.project(gaussians, camera, SETTINGS)
     order = tiles.depth_order(projected)
-    colors = tiles.shade(gaussians, camera, order, SETTINGS)
+    colors = tiles.shade(gaussians, camera, order, gaussians.sh_degree)
     lists = tiles.bin_splats(projected, order, colors, camera, keep=True)
     runs: dict[str, Run] = {}
     for threads in sorted({1, cores}):

@@ -1,6 +1,6 @@
 """The limit of a training step: the whole pipeline by hand in C++ (limit_training.cpp), forward and backward.
 
-The same work as `rasterize_differentiable`, with colours of degree 3 or with features, and the same results: image,
+The same work as `sg.rasterize`, with colours of degree 3 or with features, and the same results: image,
 alpha and the gradients of every parameter. What it leaves out is what the package promises and a limit need not: sums
 in an order that no number of threads changes, whitened moments for needles, the split centre for far origins, settings.
 """

@@ -11,7 +11,7 @@ from limit_training import TrainingLimit
 from timing import Run, fastest, plural, report, shares, stage_times
 from torch import Tensor
 
-from sgwarp.ops.differentiable import rasterize_differentiable
+from sgwarp.ops.differentiable import rasterize
 from sgwarp.scene import Camera, Gaussians
 
 GEOMETRY = ("means", "quats", "scales", "opacities")
@@ -33,9 +33,7 @@ def step(gaussians: Gaussians, camera: Camera, features: Tensor | None) -> Calla
     chosen = {"sh": values} if features is None else {"features": values}
 
     def run() -> None:
-        seen = rasterize_differentiable(
-            *leaves, camera.world_to_camera, camera.K, camera.width, camera.height, **chosen
-        )
+        seen = rasterize(*leaves, camera.world_to_camera, camera.K, camera.width, camera.height, **chosen)
         torch.autograd.backward([seen.features, seen.alpha], gradients)
         for leaf in (*leaves, values):
             leaf.grad = None

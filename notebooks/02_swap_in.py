@@ -33,7 +33,6 @@ from sgwarp.compat.inria import (  # was: from diff_gaussian_rasterization impor
     GaussianRasterizer,
 )
 from sgwarp.compat.inria import dist2 as distCUDA2  # was: from simple_knn._C import distCUDA2
-from sgwarp.ops.differentiable import rasterize_differentiable  # the native call, to compare with
 
 plt.rcParams.update({"figure.dpi": 110, "figure.constrained_layout.use": True, "font.size": 9, "axes.titlesize": 10})
 
@@ -186,7 +185,7 @@ def render_inria(p, camera):
 def render_native(p, camera):
     """Image [H, W, 3], and the tensor that receives the gradient of the centres."""
     means2d = torch.zeros(len(p["means"]), 2, requires_grad=True)
-    rendering = rasterize_differentiable(
+    rendering = sg.rasterize(
         p["means"],
         p["quats"],
         p["log_scales"].exp(),
@@ -354,4 +353,4 @@ plt.show()
 #
 # And what changes for the better: Gaussians with NaN or infinity are left out instead of spreading, and gradients on
 # the CPU have the same bits for any number of threads. When you write new code, `sg.render` and
-# `rasterize_differentiable` ask for less.
+# `sg.rasterize` ask for less.

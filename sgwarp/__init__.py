@@ -26,6 +26,8 @@ if TYPE_CHECKING:
     from sgwarp.io.views import load_views as load_views
     from sgwarp.lift import lift as lift
     from sgwarp.ops.contributors import top_contributors as top_contributors
+    from sgwarp.ops.differentiable import rasterize as rasterize
+    from sgwarp.ops.plan import RenderPlan as RenderPlan
     from sgwarp.ops.settings import RasterSettings as RasterSettings
     from sgwarp.orbit import orbit_views as orbit_views
     from sgwarp.query import evidence as evidence
@@ -33,6 +35,7 @@ if TYPE_CHECKING:
     from sgwarp.query import relevancy as relevancy
     from sgwarp.query import select as select
     from sgwarp.query import standardise as standardise
+    from sgwarp.render import plan as plan
     from sgwarp.render import render as render
     from sgwarp.runlog import RunLog as RunLog
     from sgwarp.scene import Camera as Camera
@@ -50,6 +53,7 @@ _HOME = {
     "Gaussians": "sgwarp.scene",
     "InputError": "sgwarp.errors",
     "RasterSettings": "sgwarp.ops.settings",
+    "RenderPlan": "sgwarp.ops.plan",
     "RunLog": "sgwarp.runlog",
     "Semantics": "sgwarp.scene",
     "View": "sgwarp.scene",
@@ -65,7 +69,9 @@ _HOME = {
     "localize": "sgwarp.segment",
     "make_encoder": "sgwarp.encoders.registry",
     "orbit_views": "sgwarp.orbit",
+    "plan": "sgwarp.render",
     "query": "sgwarp.query",
+    "rasterize": "sgwarp.ops.differentiable",
     "relevancy": "sgwarp.query",
     "render": "sgwarp.render",
     "save_gaussians": "sgwarp.io.scenes",

@@ -33,7 +33,7 @@ from sgwarp.fitting.photographs import (
 )
 from sgwarp.fitting.seeds import generator, view_at
 from sgwarp.fitting.settings import FitSettings
-from sgwarp.ops.differentiable import rasterize_differentiable
+from sgwarp.ops.differentiable import rasterize as rasterize_with_gradients
 from sgwarp.ops.photometric import photometric_loss
 from sgwarp.ops.rasterize import rasterize
 from sgwarp.progress import Report
@@ -214,7 +214,7 @@ class _Run:
         model.raise_degree(settings.degree_at(self.step))
         leaves = {name: model[name].detach().requires_grad_() for name in model.groups}
         centres = torch.zeros(len(model), 2, device=self.device, requires_grad=self.strategy.wants_means2d)
-        image = rasterize_differentiable(
+        image = rasterize_with_gradients(
             leaves["means"],
             leaves["quats"],
             leaves["scales"],

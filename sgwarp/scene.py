@@ -106,6 +106,16 @@ class Gaussians:
         return math.isqrt(self.sh.shape[1]) - 1
 
     @cached_property
+    def used_sh_degree(self) -> int:
+        """Highest degree with a coefficient that is not zero."""
+        for degree in range(self.sh_degree, 0, -1):
+            part = self.sh.detach()[:, degree * degree : (degree + 1) ** 2]
+            # A few rows mostly decide it; all are read only where these are zero.
+            if bool((part[:: max(1, len(part) // 256)] != 0).any()) or bool((part != 0).any()):
+                return degree
+        return 0
+
+    @cached_property
     def finite(self) -> Tensor:
         """Rows whose every field is finite, bool [N]."""
         flat = (self.means, self.quats, self.scales, self.opacities[:, None], self.sh.flatten(1))

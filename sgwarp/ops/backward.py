@@ -220,9 +220,9 @@ def project_backward(
 def shade_backward(
     gaussians: Gaussians,
     camera: Camera,
-    settings: RasterSettings,
     splats: SplatGradients,
     v_means: Tensor,
+    degree: int,
     *,
     pose: bool = False,
 ) -> tuple[Tensor, Tensor]:
@@ -233,7 +233,6 @@ def shade_backward(
         empty.
     """
     n, device = len(gaussians), gaussians.device
-    degree = gaussians.sh_degree if settings.sh_degree is None else min(settings.sh_degree, gaussians.sh_degree)
     v_sh = torch.empty_like(gaussians.sh)
     v_offsets = torch.empty(n if pose else 0, 3, device=device)
     inputs = [

@@ -10,12 +10,14 @@ from torch import Tensor
 
 from sgwarp.errors import InputError
 from sgwarp.ops import backward, tiles
-from sgwarp.ops.rasterize import Rendering, composite_recorded, packed_colors, rasterize
+from sgwarp.ops import rasterize as forward
+from sgwarp.ops.plan import RenderPlan, plan_render
+from sgwarp.ops.rasterize import Rendering, composite_recorded, packed_colors
 from sgwarp.ops.settings import RasterSettings
 from sgwarp.scene import SH_COUNTS, Camera, Gaussians
 
 
-def rasterize_differentiable(
+def rasterize(
     means: Tensor,
     quats: Tensor,
     scales: Tensor,
@@ -40,7 +42,7 @@ def rasterize_differentiable(
 ) -> Rendering:
     """Render a view (paper eq. 1) with gradients to every tensor but K.
 
-    The same image as `rasterize`. Gaussians that are left out, among them all that are not finite, get gradients of
+    The same image as `sg.render`. Gaussians that are left out, among them all that are not finite, get gradients of
     exactly zero. On the CPU gradients have the same bits for any number of threads.
 
     Args:
@@ -58,7 +60,7 @@ def rasterize_differentiable(
         means2d: float [N, 2], added to the projected centres as far as gradients go: its values are not read, and its
             gradient is that of the projected centres [1 / pixels], which densification looks at.
         absgrad: Also add the sum over pixels of the magnitude of each one's gradient to `means2d.absgrad` (AbsGS).
-        expected_depth, depth: Which depths to render, as in `rasterize`; both have gradients.
+        expected_depth, depth: Which depths to render, as in `sg.render`; both have gradients.
         near, far: Range of depth that is rendered [m].
         settings: The approximations.
         schedule: "lanes" or "block", by default the device's own; either runs on the CPU.
@@ -91,7 +93,7 @@ def rasterize_differentiable(
     if not (torch.is_grad_enabled() and any(t is not None and t.requires_grad for t in inputs)):
         colors = means.new_zeros(n, 1, 3) if sh is None else sh
         gaussians = Gaussians(means, quats, scales, opacities, colors)
-        return rasterize(
+        return forward.rasterize(
             gaussians,
             camera,
             features,
@@ -100,9 +102,17 @@ def rasterize_differentiable(
             depth=depth,
             settings=settings,
         )
-    request = _Request(
-        camera, settings, sh is not None, expected_depth or depth, means2d if absgrad else None, schedule, deterministic
+    receives_absgrad = means2d if absgrad else None
+    plan = plan_render(
+        Gaussians.unchecked(means, quats, scales, opacities, means.new_zeros(n, 1, 3) if sh is None else sh),
+        "colors" if features is None else "features",
+        channels=channels,
+        depth=expected_depth or depth,
+        record=True,
+        settings=settings,
+        look=False,
     )
+    request = _Request(camera, settings, plan, receives_absgrad, schedule, deterministic)
     means, quats, scales, opacities, values = (
         t.to(torch.float32).contiguous() for t in (means, quats, scales, opacities, values)
     )
@@ -140,12 +150,16 @@ class _Request:
 
     camera: Camera
     settings: RasterSettings
-    harmonics: bool  # the values are coefficients
-    wants_depth: bool
+    plan: RenderPlan
     receives_absgrad: Tensor | None
     schedule: str | None
     deterministic: bool | None
     status_counts: Tensor = field(default_factory=lambda: torch.empty(0, dtype=torch.int64))
+
+    @property
+    def harmonics(self) -> bool:
+        """Whether the values are coefficients."""
+        return self.plan.values == "colors"
 
 
 class _Rasterize(torch.autograd.Function):
@@ -168,10 +182,10 @@ class _Rasterize(torch.autograd.Function):
         features = None if request.harmonics else values
         projected = tiles.project(gaussians, camera, settings)
         order = tiles.depth_order(projected)
-        colors = packed_colors(gaussians, camera, features, order, settings)
+        colors = packed_colors(gaussians, camera, features, order, request.plan)
         lists = tiles.bin_splats(projected, order, colors, camera, places=True, keep=True)
         image, transmittance, depth_sum, surface, last, hit = composite_recorded(
-            lists, camera, settings, features, request.wants_depth, request.schedule
+            lists, camera, settings, features, request.plan.depth, request.schedule
         )
         request.status_counts = projected.counts()
         recorded = (transmittance, last, hit)
@@ -212,7 +226,8 @@ class _Rasterize(torch.autograd.Function):
         result = backward.project_backward(gaussians, camera, settings, splats, pose=pose)
         v_values, v_offsets = splats.features, None
         if request.harmonics:
-            v_values, v_offsets = backward.shade_backward(gaussians, camera, settings, splats, result.means, pose=pose)
+            degree = request.plan.sh_degree
+            v_values, v_offsets = backward.shade_backward(gaussians, camera, splats, result.means, degree, pose=pose)
         v_viewmat = backward.pose_gradient(camera, result.poses, v_offsets).to(viewmat) if pose else None
         if request.receives_absgrad is not None:
             _accumulate(request.receives_absgrad, splats.absolute)

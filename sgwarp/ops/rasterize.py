@@ -13,6 +13,7 @@ from sgwarp.kernels import binning, compositing_block, compositing_lanes
 from sgwarp.kernels.transmittance import Lanes
 from sgwarp.ops import tiles
 from sgwarp.ops.launch import get_threads, launch, launch_blocks, scratch, view
+from sgwarp.ops.plan import RenderPlan, Values, plan_render
 from sgwarp.ops.settings import RasterSettings
 from sgwarp.scene import Camera, Gaussians
 
@@ -54,6 +55,7 @@ def rasterize(
     expected_depth: bool = False,
     depth: bool = False,
     settings: RasterSettings = RasterSettings(),  # noqa: B008 - frozen
+    plan: RenderPlan | None = None,
 ) -> Rendering:
     """Render a view (paper eq. 1): project, order by (depth, index), list per tile, composite front to back.
 
@@ -64,6 +66,7 @@ def rasterize(
         background: float32 [C], seen through what is left transparent; None is zero.
         expected_depth, depth: Which depths to render; without them nothing is computed for them.
         settings: The approximations.
+        plan: What to compute, and what not; derived from the scene and the request if None.
 
     Raises:
         InputError: `features` or `background` do not fit.
@@ -77,12 +80,15 @@ def rasterize(
     if background is not None and tuple(background.shape) != (channels,):
         raise InputError(f"background: expected shape [{channels}], got {list(background.shape)}")
 
+    if plan is None:
+        values: Values = "colors" if features is None else "features"
+        wants_depth = expected_depth or depth
+        plan = plan_render(gaussians, values, channels=channels, depth=wants_depth, settings=settings)
     projected = tiles.project(gaussians, camera, settings)
     order = tiles.depth_order(projected)
-    colors = packed_colors(gaussians, camera, features, order, settings)
+    colors = packed_colors(gaussians, camera, features, order, plan)
     lists = tiles.bin_splats(projected, order, colors, camera)
-    wants_depth = expected_depth or depth
-    image, transmittance, depth_sum, surface = composite(lists, camera, settings, features, wants_depth)
+    image, transmittance, depth_sum, surface = composite(lists, camera, settings, features, plan.depth)
     if background is not None:
         image = image + transmittance[..., None] * background.to(image)
     alpha = 1.0 - transmittance
@@ -93,11 +99,13 @@ def rasterize(
 
 
 def packed_colors(
-    gaussians: Gaussians, camera: Camera, features: Tensor | None, order: Tensor, settings: RasterSettings
+    gaussians: Gaussians, camera: Camera, features: Tensor | None, order: Tensor, plan: RenderPlan
 ) -> Tensor | None:
     """Colours by depth order. Three channels travel with the splats; more are gathered while compositing."""
+    if plan.values == "nothing":
+        return None
     if features is None:
-        return tiles.shade(gaussians, camera, order, settings)
+        return tiles.shade(gaussians, camera, order, plan.sh_degree)
     if features.shape[1] > 3:
         return None
     padded = torch.zeros(len(order), 3, dtype=torch.float32, device=gaussians.device)

@@ -171,9 +171,8 @@ def depth_order(projected: Projected) -> Tensor:
     return order[:count]
 
 
-def shade(gaussians: Gaussians, camera: Camera, order: Tensor, settings: RasterSettings) -> Tensor:
-    """Colours of the visible Gaussians seen from the camera, in depth order, float32 [V, 3]."""
-    degree = gaussians.sh_degree if settings.sh_degree is None else min(settings.sh_degree, gaussians.sh_degree)
+def shade(gaussians: Gaussians, camera: Camera, order: Tensor, degree: int) -> Tensor:
+    """Colours of the visible Gaussians seen from the camera, in depth order, float32 [V, 3]; degree 0 to 3."""
     colors = scratch("colors", 3 * len(order), torch.float32, gaussians.device).view(-1, 3)
     inputs = [
         view(order, wp.int32),

@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 
 from sgwarp.ops import reference, tiles
-from sgwarp.ops.differentiable import rasterize_differentiable
+from sgwarp.ops.differentiable import rasterize
 from sgwarp.ops.rasterize import composite
 from sgwarp.ops.settings import RasterSettings
 from sgwarp.report.extremes import Extreme
@@ -97,7 +97,7 @@ def check_gradients(extreme: Extreme, schedule: Schedule = "lanes") -> GradientR
     weights = torch.randn(*camera.size, 4, generator=rng) * decidable(expected)[..., None]
     (torch.cat([expected.features, expected.alpha[..., None]], dim=2) * weights).sum().backward()
     mine = {name: getattr(gaussians, name).clone().requires_grad_() for name in FIELDS}
-    got = rasterize_differentiable(
+    got = rasterize(
         mine["means"],
         mine["quats"],
         mine["scales"],
@@ -132,7 +132,7 @@ def _render(
     settings = RasterSettings()
     projected = tiles.project(gaussians, camera, settings)
     order = tiles.depth_order(projected)
-    lists = tiles.bin_splats(projected, order, tiles.shade(gaussians, camera, order, settings), camera)
+    lists = tiles.bin_splats(projected, order, tiles.shade(gaussians, camera, order, gaussians.sh_degree), camera)
     image, transmittance, depth_sum, surface = composite(lists, camera, settings, None, True, schedule)
     alpha = 1.0 - transmittance
     return image, alpha, depth_sum / alpha.clamp(min=1e-12), surface, tiles.culled(projected.counts())

@@ -9,7 +9,7 @@ from torch import Tensor
 
 from sgwarp.errors import InputError
 from sgwarp.ops import launch, reference
-from sgwarp.ops.differentiable import rasterize_differentiable
+from sgwarp.ops.differentiable import rasterize as rasterize_differentiable
 from sgwarp.ops.rasterize import Rendering, rasterize
 from sgwarp.ops.settings import RasterSettings
 from sgwarp.report.extremes import EXTREMES

@@ -23,7 +23,7 @@ def lists_of(
     settings = RasterSettings()
     projected = tiles.project(gaussians, camera, settings)
     order = tiles.depth_order(projected)
-    colors = tiles.shade(gaussians, camera, order, settings)
+    colors = tiles.shade(gaussians, camera, order, gaussians.sh_degree)
     return projected, order, colors, tiles.bin_splats(projected, order, colors, camera, places=True, tiles=True)
 
 

@@ -86,14 +86,14 @@ def test_an_error_and_a_nan_are_found(monkeypatch):
 @pytest.mark.parametrize(("argument", "name"), [(2, "scales"), (4, "rotation"), (4, "translation")])
 def test_a_wrong_gradient_is_found(monkeypatch, argument, name):
     """The same values, and gradients that are one percent too large."""
-    right = stability.rasterize_differentiable
+    right = stability.rasterize
 
     def wrong(*arguments, **options):
         spoiled = list(arguments)
         spoiled[argument] = spoiled[argument] + 0.01 * (spoiled[argument] - spoiled[argument].detach())
         return right(*spoiled, **options)
 
-    monkeypatch.setattr(stability, "rasterize_differentiable", wrong)
+    monkeypatch.setattr(stability, "rasterize", wrong)
     result = check_gradients(EXTREMES["flat"])
     assert result.finite
     assert result.errors[name] == pytest.approx(0.01, rel=0.1)
