@@ -10,6 +10,7 @@ from limit_training import TrainingLimit
 from timing import Run, fastest, plural, report, shares, stage_times
 
 from sgwarp.ops import tiles
+from sgwarp.ops.plan import plan_render
 from sgwarp.ops.rasterize import composite, packed_colors, rasterize
 from sgwarp.ops.settings import RasterSettings
 
@@ -49,7 +50,7 @@ def channels(count: int, width: int, cores: int, rounds: int) -> dict[str, float
     features = torch.randn(count, width, generator=torch.Generator().manual_seed(0))
     projected = tiles.project(gaussians, camera, SETTINGS)
     order = tiles.depth_order(projected)
-    colors = packed_colors(gaussians, camera, features, order, SETTINGS)
+    colors = packed_colors(gaussians, camera, features, order, plan_render(gaussians, "features", channels=width))
     lists = tiles.bin_splats(projected, order, colors, camera, keep=True)
     runs: dict[str, Run] = {}
     for threads in sorted({1, cores}):

@@ -9,8 +9,8 @@ from functools import cache
 
 import warp as wp
 
-from sgwarp.kernels.binning import AHEAD, TILE, Fragment, fragment_of, prefetch
-from sgwarp.kernels.compositing_rows import row_walk
+from sgwarp.kernels.binning import TILE, Fragment, fragment_of
+from sgwarp.kernels.compositing_rows import gather_batch, row_walk, write_row
 from sgwarp.kernels.gaussian import Splat
 from sgwarp.kernels.projection import Knobs
 from sgwarp.kernels.transmittance import (
@@ -137,19 +137,11 @@ def color_walk(depth: bool, record: bool) -> wp.Function:
         first = offsets[tile]
         stop = offsets[tile + 1]
         for start in range(first, stop, BATCH):
-            size = wp.min(BATCH, stop - start)
-            for b in range(size):
-                prefetch(splats, listed[wp.min(start + b + AHEAD, stop - 1)])
-                f = fragment_of(splats, listed[start + b], x0, y0)
-                batch[slot, b] = f
-                reached[slot, 0, b] = f.first_row
-                reached[slot, 1, b] = f.last_row
-            for b in range(size, BATCH):
-                reached[slot, 1, b] = -1
+            gather_batch(slot, start, stop, x0, y0, listed, splats, batch, reached)
             for row in range(TILE):
-                if (open_rows >> row) & 1 != 0:
-                    composite_row(slot, row, start - first, batch, reached, knobs, state)
-            open_rows = still_open(open_rows, state, slot)
+                if (open_rows >> row) & 1 != 0:  # noqa: SIM102 - Warp evaluates both sides of an `and`
+                    if not composite_row(slot, row, start - first, batch, reached, knobs, state):
+                        open_rows = open_rows & ~(1 << row)
             if open_rows == 0:
                 break
 
@@ -186,28 +178,6 @@ def write_last(
         last = state[slot, row, plane]
         for i in range(wp.min(LANES, width - x0)):
             last_out[y0 + row, x0 + i] = int(last[i])
-
-
-@wp.func
-def write_colors(
-    slot: int,
-    x0: int,
-    y0: int,
-    width: int,
-    height: int,
-    state: wp.array3d[Lanes],
-    colors_out: wp.array2d[wp.vec3],
-    transmittance_out: wp.array2d[float],
-):
-    """Colours and transmittance of a tile, from lanes to pixels."""
-    for row in range(wp.min(TILE, height - y0)):
-        T = state[slot, row, 0]
-        r = state[slot, row, 1]
-        g = state[slot, row, 2]
-        b = state[slot, row, 3]
-        for i in range(wp.min(LANES, width - x0)):
-            colors_out[y0 + row, x0 + i] = wp.vec3(r[i], g[i], b[i])
-            transmittance_out[y0 + row, x0 + i] = wp.abs(T[i])
 
 
 @cache
@@ -249,7 +219,9 @@ def make_composite_colors(depth: bool, record: bool) -> wp.Kernel:
         x0 = (tile % columns) * TILE
         y0 = (tile / columns) * TILE
         walk(tile, slot, offsets, listed, splats, knobs, width, height, state, batch, reached)
-        write_colors(slot, x0, y0, width, height, state, colors_out, transmittance_out)
+        for row in range(wp.min(TILE, height - y0)):
+            inside = wp.min(LANES, width - x0)
+            write_row(slot, row, y0 + row, x0, inside, state, colors_out, transmittance_out)
         if wp.static(record):
             write_last(slot, x0, y0, width, height, state, last_plane, last_out)
         if wp.static(depth):

@@ -9,7 +9,8 @@ from functools import cache
 
 import warp as wp
 
-from sgwarp.kernels.binning import Fragment
+from sgwarp.kernels.binning import AHEAD, Fragment
+from sgwarp.kernels.gaussian import Splat
 from sgwarp.kernels.projection import Knobs
 from sgwarp.kernels.transmittance import LaneIds, Lanes
 
@@ -41,6 +42,52 @@ ALPHA = """
         Row alpha = level < knobs.alpha_min_level ? zero : __builtin_elementwise_min(p, one * knobs.alpha_max);
 """
 
+# Fragments of a batch, and which rows of the tile each reaches: `fragment_of` and `row_range`, 16 at a time.
+GATHER = """
+    for (int half = 0; half < 32; half += 16) {
+        Row x, y, a, b, c, inv_bc, half_width;
+        for (int i = 0; i < 16; ++i) {
+            const int k = start + half + i < stop ? start + half + i : stop - 1;
+            __builtin_prefetch(splats.data + listed.data[k + AHEAD < stop ? k + AHEAD : stop - 1]);
+            const auto& s = splats.data[listed.data[k]];
+            auto& f = batch.data[slot * 32 + half + i];
+            const float left = x0, top = y0;
+            f.x = s.mean[0] - left - 0.5f, f.y = s.mean[1] - top - 0.5f;
+            f.a = s.a, f.b = s.b, f.c = s.c, f.level = s.level, f.depth = s.depth, f.color = s.color;
+            x[i] = f.x, y[i] = f.y, a[i] = s.a, b[i] = s.b, c[i] = s.c;
+            inv_bc[i] = s.inv_bc, half_width[i] = s.half_width;
+        }
+        const Row lo = __builtin_elementwise_max(-x, -half_width);
+        const Row hi = __builtin_elementwise_min(15.0f - x, half_width);
+        const Row summit = -half_width * b * inv_bc, unit = a * inv_bc * inv_bc, w2 = half_width * half_width;
+        const Row below = __builtin_elementwise_min(__builtin_elementwise_max(summit, lo), hi);
+        const Row above = __builtin_elementwise_min(__builtin_elementwise_max(-summit, lo), hi);
+        const Row down = c * __builtin_elementwise_sqrt(__builtin_elementwise_max(w2 - below * below, zero));
+        const Row up = c * __builtin_elementwise_sqrt(__builtin_elementwise_max(w2 - above * above, zero));
+        const Row last = y + (down - b * below) * unit, first = y - (up + b * above) * unit;
+        const Row top_row = __builtin_elementwise_min(__builtin_elementwise_max(first, zero), one * 16.0f);
+        const Row bottom_row = __builtin_elementwise_min(__builtin_elementwise_max(last, -one), one * 15.0f);
+        Ints* const rows = reinterpret_cast<Ints*>(reached.data + slot * 64 + half);
+        rows[0] = __builtin_convertvector(__builtin_elementwise_ceil(top_row), Ints);
+        rows[2] = __builtin_convertvector(__builtin_elementwise_floor(bottom_row), Ints);
+        for (int i = 0; i < 16; ++i)
+            if (start + half + i >= stop) reached.data[slot * 64 + 32 + half + i] = -1;  // beyond the list
+    }
+"""
+
+# A row of the scratch as pixels of the image.
+WRITE = """
+    const int pixel = y * colors_out.shape[1] + x0;
+    const Row* const row_state = reinterpret_cast<const Row*>(state.data + (slot * 16 + row) * state.shape[2]);
+    const Row T = __builtin_elementwise_abs(row_state[0]);
+    float* const rgb = reinterpret_cast<float*>(colors_out.data + pixel);
+    float* const left = transmittance_out.data + pixel;
+    for (int i = 0; i < inside; ++i) {
+        rgb[3 * i] = row_state[1][i], rgb[3 * i + 1] = row_state[2][i], rgb[3 * i + 2] = row_state[3][i];
+        left[i] = T[i];
+    }
+"""
+
 FORWARD = """
     const int planes = state.shape[2];
     Row* const row_state = reinterpret_cast<Row*>(state.data + (slot * 16 + row) * planes);
@@ -50,7 +97,7 @@ FORWARD = """
     const Bits low = __builtin_convertvector(limits[0] <= row & limits[2] >= row, Bits);
     const Bits high = __builtin_convertvector(limits[1] <= row & limits[3] >= row, Bits);
     unsigned left = __builtin_bit_cast(unsigned short, low) | unsigned(__builtin_bit_cast(unsigned short, high)) << 16;
-    if (!left) return;
+    if (!left) return true;
     Row T = row_state[0], red = row_state[1], green = row_state[2], blue = row_state[3];
     Row z = zero, surface = zero, last = zero;
     if (DEPTH) z = row_state[4], surface = row_state[5];
@@ -76,6 +123,7 @@ FORWARD = """
     row_state[0] = T, row_state[1] = red, row_state[2] = green, row_state[3] = blue;
     if (DEPTH) row_state[4] = z, row_state[5] = surface;
     if (RECORD) row_state[planes - 1] = last;
+    return __builtin_reduce_max(T) > 0.0f;
 """
 
 BACKWARD = """
@@ -159,9 +207,36 @@ def snippet(body: str, **constants: object) -> str:
     return body
 
 
+@wp.func_native(snippet(GATHER, AHEAD=int(AHEAD)))
+def gather_batch(
+    slot: int,
+    start: int,  # first place of the batch
+    stop: int,  # end of the tile's list
+    x0: int,  # first pixel of the tile
+    y0: int,
+    listed: wp.array[int],  # [I]
+    splats: wp.array[Splat],  # [V]
+    batch: wp.array2d[Fragment],  # [slots, 32] out
+    reached: wp.array3d[int],  # [slots, 2, 32] out: first and last row that each of them reaches
+): ...
+
+
+@wp.func_native(snippet(WRITE))
+def write_row(
+    slot: int,
+    row: int,
+    y: int,  # of the row in the image
+    x0: int,  # its first pixel
+    inside: int,  # pixels of the row that lie in the image
+    state: wp.array3d[Lanes],  # [slots, 16, planes]
+    colors_out: wp.array2d[wp.vec3],  # [H, W]
+    transmittance_out: wp.array2d[float],  # [H, W]
+): ...
+
+
 @cache
 def row_walk(depth: bool, record: bool) -> wp.Function:
-    """Device function that composites the fragments of a batch into the scratch of one row."""
+    """Device function that composites the fragments of a batch into the scratch of one row; is any pixel open still?"""
 
     @wp.func_native(snippet(FORWARD, DEPTH=depth, RECORD=record))
     def composite_row(
@@ -172,7 +247,7 @@ def row_walk(depth: bool, record: bool) -> wp.Function:
         reached: wp.array3d[int],  # [slots, 2, 32] first and last row that each of them reaches
         knobs: Knobs,
         state: wp.array3d[Lanes],  # [slots, 16, planes] as in `color_walk`
-    ): ...
+    ) -> bool: ...
 
     return composite_row
 
