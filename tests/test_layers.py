@@ -28,6 +28,7 @@ ORDER = (
     "datasets",
     "encoders",
     "pictures",
+    "nn",
     "render",
     "orbit",
     "residual",
