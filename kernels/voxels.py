@@ -1,7 +1,8 @@
 """Voxels as sorted integer keys, and kernel maps: which voxel lies at which offset of which other.
 
 A key packs a batch number (12 bits) and x, y, z (17 bits each, moved up by 2^16 so that no field is negative). An
-offset is then one constant added to a key, and clearing the low bits of a field rounds down, below zero as well. Adding an offset keeps sorted keys sorted, so a kernel map is a merge of two sorted lists: no hash, no atomics.
+offset is then one constant added to a key, and clearing the low bits of a field rounds down, below zero as well. Adding
+an offset keeps sorted keys sorted, so a kernel map is a merge of two sorted lists: no hash, no atomics.
 """
 
 import warp as wp

@@ -11,6 +11,10 @@ from typing import TYPE_CHECKING, Any
 from sgwarp.version import __version__ as __version__
 
 if TYPE_CHECKING:
+    from sgwarp.distill.data import TrainingScene as TrainingScene
+    from sgwarp.distill.data import scenes_in as scenes_in
+    from sgwarp.distill.settings import DistillSettings as DistillSettings
+    from sgwarp.distill.train import distill as distill
     from sgwarp.encoders.registry import make_encoder as make_encoder
     from sgwarp.encoders.registry import text_encoder_for as text_encoder_for
     from sgwarp.errors import InputError as InputError
@@ -21,8 +25,12 @@ if TYPE_CHECKING:
     from sgwarp.io.store import save_semantics as save_semantics
     from sgwarp.io.views import load_views as load_views
     from sgwarp.lift import lift as lift
+    from sgwarp.network import SemanticNetwork as SemanticNetwork
+    from sgwarp.network import load_network as load_network
+    from sgwarp.network import save_network as save_network
     from sgwarp.ops.settings import RasterSettings as RasterSettings
     from sgwarp.orbit import orbit_views as orbit_views
+    from sgwarp.predict import predict as predict
     from sgwarp.query import evidence as evidence
     from sgwarp.query import query as query
     from sgwarp.query import relevancy as relevancy
@@ -40,27 +48,35 @@ if TYPE_CHECKING:
 
 _HOME = {
     "Camera": "sgwarp.scene",
+    "DistillSettings": "sgwarp.distill.settings",
     "FeatureMap": "sgwarp.scene",
     "Gaussians": "sgwarp.scene",
     "InputError": "sgwarp.errors",
     "RasterSettings": "sgwarp.ops.settings",
     "RunLog": "sgwarp.runlog",
+    "SemanticNetwork": "sgwarp.network",
     "Semantics": "sgwarp.scene",
+    "TrainingScene": "sgwarp.distill.data",
     "View": "sgwarp.scene",
+    "distill": "sgwarp.distill.train",
     "evidence": "sgwarp.query",
     "gaussians_from_depth": "sgwarp.from_depth",
     "lift": "sgwarp.lift",
     "load_gaussians": "sgwarp.io.scenes",
+    "load_network": "sgwarp.network",
     "load_semantics": "sgwarp.io.store",
     "load_views": "sgwarp.io.views",
     "localize": "sgwarp.segment",
     "make_encoder": "sgwarp.encoders.registry",
     "orbit_views": "sgwarp.orbit",
+    "predict": "sgwarp.predict",
     "query": "sgwarp.query",
     "relevancy": "sgwarp.query",
     "render": "sgwarp.render",
     "save_gaussians": "sgwarp.io.scenes",
+    "save_network": "sgwarp.network",
     "save_semantics": "sgwarp.io.store",
+    "scenes_in": "sgwarp.distill.data",
     "segment": "sgwarp.segment",
     "select": "sgwarp.query",
     "standardise": "sgwarp.query",

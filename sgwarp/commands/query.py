@@ -51,15 +51,18 @@ class Query(SemanticsOptions):
         if self.box < 1:
             raise InputError(f"--box: expected a side of 1 pixel or more, got {self.box}")
         with self.logged(self.out.parent) as log:
+            from sgwarp.ensemble import seen_by
             from sgwarp.io.images import write_ids, write_rgb
             from sgwarp.pictures import heat_map, mark_pixel
             from sgwarp.segment import localize
 
             gaussians, semantics = self.load_both(log)
+            predicted = self.load_predicted(gaussians, log)
+            seen = seen_by(semantics, predicted, self.ensemble)
             (view,) = find_views(self.views, self.view)
-            scores = self._scores(semantics, log)
+            scores = self._scores(semantics, predicted, log)
             with log.stage("splat"):
-                (x, y), score_map = localize(scores, gaussians, view.camera, seen=semantics.seen, box=self.box)
+                (x, y), score_map = localize(scores, gaussians, view.camera, seen=seen, box=self.box)
             mask = score_map > self.threshold
             print(f"{self.text}: best pixel ({x}, {y}), score {score_map[y, x]:.3f}; mask {mask.float().mean():.2%}")
             with log.stage("write"):
@@ -69,15 +72,21 @@ class Query(SemanticsOptions):
                 write_rgb(heat, mark_pixel(picture, (x, y)))
             log.outputs += [str(self.out), str(heat)]
 
-    def _scores(self, semantics: Semantics, log: RunLog) -> Tensor:
+    def _scores(self, semantics: Semantics, predicted: Semantics | None, log: RunLog) -> Tensor:
         """Score of every Gaussian on the scale of the mask, [N]."""
         from sgwarp.encoders.registry import text_encoder_for
+        from sgwarp.ensemble import combine, require_together, seen_by
         from sgwarp.query import class_votes, evidence, query, relevancy, rescale
 
         if semantics.labels is not None:
-            return class_votes(semantics, [self.text])[:, 0]
+            return class_votes(semantics, [self.text], predicted=predicted, ensemble=self.ensemble)[:, 0]
         with log.stage("load_encoder"):
             encoder = text_encoder_for(semantics.space)
         with log.stage("query"):
             score = query if self.score == "cosine" else relevancy
-            return rescale(evidence(score(semantics, [self.text], encoder), semantics), semantics.seen)[:, 0]
+            scores = evidence(score(semantics, [self.text], encoder), semantics)
+            if predicted is not None:
+                require_together(semantics, predicted)
+                others = evidence(score(predicted, [self.text], encoder), predicted)
+                scores = combine(scores, others, (semantics.seen, predicted.seen), self.ensemble)
+            return rescale(scores, seen_by(semantics, predicted, self.ensemble))[:, 0]
