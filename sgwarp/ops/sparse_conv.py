@@ -13,6 +13,7 @@ from torch import Tensor
 from torch.autograd.function import once_differentiable
 
 from sgwarp.errors import InputError
+from sgwarp.ops.launch import scratch
 from sgwarp.ops.voxels import KernelMap
 
 HALVES = (torch.float16, torch.bfloat16)
@@ -83,8 +84,10 @@ def _convolve(features: Tensor, weight: Tensor, kernel_map: KernelMap) -> Tensor
         y = torch.mm(features, weight[kernel_map.identity]).to(accumulate)
     for k, (start, stop) in enumerate(zip(kernel_map.starts, kernel_map.starts[1:], strict=False)):
         if start < stop:
-            rows = features.index_select(0, kernel_map.sources[start:stop])
-            y.index_add_(0, kernel_map.targets[start:stop], torch.mm(rows, weight[k]).to(accumulate))
+            rows = _gathered("sources", features, kernel_map.sources[start:stop])
+            product = _borrowed("products", len(rows), weight.shape[2], features)
+            torch.mm(rows, weight[k], out=product)
+            y.index_add_(0, kernel_map.targets[start:stop], product.to(accumulate))
     return y.to(features.dtype)
 
 
@@ -94,9 +97,19 @@ def _weight_gradient(features: Tensor, grad: Tensor, kernel_map: KernelMap) -> T
     v_weight = features.new_zeros(kernel_map.offsets, features.shape[1], grad.shape[1], dtype=accumulate)
     for k, (start, stop) in enumerate(zip(kernel_map.starts, kernel_map.starts[1:], strict=False)):
         if start < stop:
-            rows = features.index_select(0, kernel_map.sources[start:stop]).to(accumulate)
-            reached = grad.index_select(0, kernel_map.targets[start:stop]).to(accumulate)
+            rows = _gathered("sources", features, kernel_map.sources[start:stop]).to(accumulate)
+            reached = _gathered("targets", grad, kernel_map.targets[start:stop]).to(accumulate)
             torch.mm(rows.T, reached, out=v_weight[k])
     if kernel_map.identity is not None:
         torch.mm(features.T.to(accumulate), grad.to(accumulate), out=v_weight[kernel_map.identity])
     return v_weight
+
+
+def _gathered(name: str, values: Tensor, rows: Tensor) -> Tensor:
+    """values[rows] in memory that the next offset writes over."""
+    return torch.index_select(values, 0, rows, out=_borrowed(name, len(rows), values.shape[1], values))
+
+
+def _borrowed(name: str, count: int, channels: int, like: Tensor) -> Tensor:
+    """Scratch of shape [count, channels]: fresh memory costs about as much as the product that is written to it."""
+    return scratch(f"sparse_conv {name}", count * channels, like.dtype, like.device).view(count, channels)
