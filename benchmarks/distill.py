@@ -77,19 +77,24 @@ def lifted_room(seed: int, count: int, views: int) -> tuple[Room, Semantics]:
     return room, lift(room.gaussians, posed, maps)
 
 
-def miou(room: Room, votes: Tensor, seen: Tensor, confusion: ConfusionMatrix) -> None:
-    confusion.add(torch.where(seen, votes.argmax(dim=1), -1), room.classes)
-
-
 def measure(rooms: list[tuple[Room, Semantics]], predicted: list[Semantics]) -> dict[str, dict[str, float]]:
-    """mIoU, mean accuracy and unknown share of every ensemble over the Gaussians of all rooms together."""
+    """Figures of every ensemble over the Gaussians of all rooms together, and over those that some view saw."""
     text, results = ToyText(), {}
     for how in ENSEMBLES:
-        confusion = ConfusionMatrix.empty(len(CLASSES))
+        everywhere, where_seen = ConfusionMatrix.empty(len(CLASSES)), ConfusionMatrix.empty(len(CLASSES))
         for (room, projected), other in zip(rooms, predicted, strict=True):
             votes = class_votes(projected, CLASSES, text, predicted=other, ensemble=how)  # type: ignore[arg-type]
-            miou(room, votes, seen_by(projected, other, how), confusion)  # type: ignore[arg-type]
-        results[how] = {"mIoU": confusion.miou, "mAcc": confusion.macc, "unknown": confusion.unknown}
+            known = seen_by(projected, other, how)  # type: ignore[arg-type]
+            answer = torch.where(known, votes.argmax(dim=1), -1)
+            everywhere.add(answer, room.classes)
+            where_seen.add(answer[projected.seen], room.classes[projected.seen])
+        results[how] = {
+            "mIoU": everywhere.miou,
+            "mAcc": everywhere.macc,
+            "accuracy": everywhere.pixel_accuracy,
+            "unknown": everywhere.unknown,
+            "mIoU where a view saw it": where_seen.miou,
+        }
     return results
 
 
@@ -119,7 +124,6 @@ def main() -> None:
         arch=options.arch,
         voxel=options.voxel,
         epochs=options.epochs,
-        scenes_per_step=2,
         augment=Augmentation(up=1, elastic=()),
     )
     for inputs in options.inputs:

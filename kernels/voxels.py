@@ -5,6 +5,8 @@ offset is then one constant added to a key, and clearing the low bits of a field
 an offset keeps sorted keys sorted, so a kernel map is a merge of two sorted lists: no hash, no atomics.
 """
 
+from functools import cache
+
 import warp as wp
 
 from sgwarp.kernels.gaussian import EXACT_OPTIONS
@@ -64,62 +66,44 @@ def key_points(
     keys_out[i] = key
 
 
-@wp.kernel
-def count_pairs(
-    # In:
-    base: int,  # first (offset, chunk) of this launch
-    steps: wp.array[wp.int64],  # [K] what each offset adds to a key
-    sources: wp.array[wp.int64],  # [N] sorted keys of the voxels that are read
-    targets: wp.array[wp.int64],  # [M] sorted keys of the voxels that are written
-    per_chunk: int,  # targets that one thread walks
-    chunks: int,  # of the targets
-    # Out:
-    counts_out: wp.array[int],  # [K * chunks] pairs of each offset and chunk
-):
-    """Count, offset by offset, the targets whose neighbour at that offset is a source."""
-    place = base + wp.tid()
-    step = steps[place / chunks]
-    first = (place % chunks) * per_chunk
-    last = wp.min(first + per_chunk, targets.shape[0])
-    n = sources.shape[0]
-    j = first_not_below(sources, targets[first] + step)
-    count = int(0)
-    for i in range(first, last):
-        wanted = targets[i] + step
-        while j < n and sources[j] < wanted:
-            j += 1
-        if j < n and sources[j] == wanted:
-            count += 1
-    counts_out[place] = count
+@cache
+def make_list_pairs(write: bool) -> wp.Kernel:
+    """Kernel that counts, offset by offset, the targets whose neighbour at that offset is a source, or lists them."""
 
+    @wp.kernel(module="unique", module_options=EXACT_OPTIONS, enable_backward=False)
+    def list_pairs(
+        # In:
+        base: int,  # first (offset, chunk) of this launch
+        steps: wp.array[wp.int64],  # [K] what each offset adds to a key
+        sources: wp.array[wp.int64],  # [N] sorted keys of the voxels that are read
+        targets: wp.array[wp.int64],  # [M] sorted keys of the voxels that are written
+        per_chunk: int,  # targets that one thread walks
+        chunks: int,  # of the targets
+        places: wp.array[wp.int64],  # [K * chunks] where the pairs of each offset and chunk go; only with `write`
+        # Out:
+        counts_out: wp.array[int],  # [K * chunks] pairs of each offset and chunk; not written with `write`
+        source_rows_out: wp.array[wp.int64],  # [pairs]; only with `write`
+        target_rows_out: wp.array[wp.int64],  # [pairs], increasing within an offset; only with `write`
+    ):
+        """Merge a chunk of the targets, moved by an offset, with the sources."""
+        place = base + wp.tid()
+        step = steps[place / chunks]
+        first = (place % chunks) * per_chunk
+        last = wp.min(first + per_chunk, targets.shape[0])
+        n = sources.shape[0]
+        j = first_not_below(sources, targets[first] + step)
+        count = int(0)
+        for i in range(first, last):
+            wanted = targets[i] + step
+            while j < n and sources[j] < wanted:
+                j += 1
+            if j < n and sources[j] == wanted:
+                if wp.static(write):
+                    at = places[place] + wp.int64(count)
+                    source_rows_out[at] = wp.int64(j)
+                    target_rows_out[at] = wp.int64(i)
+                count += 1
+        if wp.static(not write):
+            counts_out[place] = count
 
-@wp.kernel
-def fill_pairs(
-    # In:
-    base: int,  # first (offset, chunk) of this launch
-    steps: wp.array[wp.int64],  # [K] what each offset adds to a key
-    sources: wp.array[wp.int64],  # [N] sorted keys of the voxels that are read
-    targets: wp.array[wp.int64],  # [M] sorted keys of the voxels that are written
-    per_chunk: int,  # targets that one thread walks
-    chunks: int,  # of the targets
-    places: wp.array[wp.int64],  # [K * chunks] where the pairs of each offset and chunk go
-    # Out:
-    source_rows_out: wp.array[wp.int64],  # [pairs]
-    target_rows_out: wp.array[wp.int64],  # [pairs], increasing within an offset
-):
-    """Write the pairs that `count_pairs` counted, by the same walk."""
-    place = base + wp.tid()
-    step = steps[place / chunks]
-    first = (place % chunks) * per_chunk
-    last = wp.min(first + per_chunk, targets.shape[0])
-    n = sources.shape[0]
-    j = first_not_below(sources, targets[first] + step)
-    at = places[place]
-    for i in range(first, last):
-        wanted = targets[i] + step
-        while j < n and sources[j] < wanted:
-            j += 1
-        if j < n and sources[j] == wanted:
-            source_rows_out[at] = wp.int64(j)
-            target_rows_out[at] = wp.int64(i)
-            at += wp.int64(1)
+    return list_pairs

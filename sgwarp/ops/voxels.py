@@ -165,8 +165,8 @@ def _starts(counts: list[int]) -> tuple[int, ...]:
 def _merge(sources: Tensor, targets: Tensor, steps: list[int]) -> tuple[Tensor, Tensor, list[int]]:
     """Rows of sources and of targets, offset by offset, and how many of each offset."""
     device = targets.device
+    nothing = torch.empty(0, dtype=torch.int64, device=device)
     if not steps or not len(sources) or not len(targets):
-        nothing = torch.empty(0, dtype=torch.int64, device=device)
         return nothing, nothing, [0] * len(steps)
     per_chunk = min(PER_CHUNK[device.type], max(64, len(targets) // 8))
     chunks = -(-len(targets) // per_chunk)
@@ -174,12 +174,17 @@ def _merge(sources: Tensor, targets: Tensor, steps: list[int]) -> tuple[Tensor, 
     added = torch.tensor(steps, dtype=torch.int64, device=device)
     inputs = [*(view(t, wp.int64) for t in (added, sources, targets)), per_chunk, chunks]
     counts = torch.empty(threads, dtype=torch.int32, device=device)
-    share = max(1, threads // 32)  # a kernel thread is long: even few of them are worth two host threads
-    launch(voxels.count_pairs, threads, inputs, [view(counts, wp.int32)], device=device, chunk=share)
+    rows = [nothing, nothing]
+
+    def run(write: bool, places: Tensor) -> None:
+        outputs = [view(counts, wp.int32), *(view(row, wp.int64) for row in rows)]
+        kernel = voxels.make_list_pairs(write)
+        share = max(1, threads // 32)  # a kernel thread is long: even few of them are worth two host threads
+        launch(kernel, threads, [*inputs, view(places, wp.int64)], outputs, device=device, chunk=share)
+
+    run(False, nothing)
     ends = counts.cumsum(0, dtype=torch.int64)
     per_offset = counts.view(len(steps), chunks).sum(dim=1).tolist()
-    rows = torch.empty(2, sum(per_offset), dtype=torch.int64, device=device)
-    inputs.append(view(ends - counts, wp.int64))
-    outputs = [view(row, wp.int64) for row in rows]
-    launch(voxels.fill_pairs, threads, inputs, outputs, device=device, chunk=share)
+    rows = [torch.empty(sum(per_offset), dtype=torch.int64, device=device) for _ in range(2)]
+    run(True, ends - counts)
     return rows[0], rows[1], per_offset

@@ -13,7 +13,7 @@ import pytest
 import warp as wp
 
 import sgwarp.kernels
-from sgwarp.kernels import compositing_block, compositing_block_backward, lifting_block, pixel_lists
+from sgwarp.kernels import compositing_block, compositing_block_backward, lifting_block, pixel_lists, voxels
 from sgwarp.ops import launch  # noqa: F401 - starts Warp quietly
 
 ARCHITECTURES = (80, 86, 89, 90)
@@ -34,6 +34,7 @@ def cuda_kernels() -> list[wp.Kernel]:
         kernels.append(lifting_block.make_lift_dense_block(flag))
         kernels.append(lifting_block.make_lift_ids_block(flag))
         kernels.append(pixel_lists.make_list_contributors(flag))
+        kernels.append(voxels.make_list_pairs(flag))
     kernels.append(compositing_block.make_composite_features_block())
     kernels.append(compositing_block.make_record_features_block())
     for wide, ordered in itertools.product((False, True), repeat=2):
@@ -57,6 +58,7 @@ def test_the_list_of_kernels_is_complete():
     }
     assert factories <= names
     assert {"project_backward", "harmonics_backward", "sum_intersections", "sum_groups"} <= names
+    assert {"key_points", "list_pairs"} <= names
 
 
 @pytest.fixture(scope="module")
