@@ -23,13 +23,13 @@ from pathlib import Path
 
 import numpy as np
 
-SOURCE = Path(__file__).with_name("limit.cpp")
+FOLDER = Path(__file__).parent
 FLAGS = ("-O3", "-march=native", "-ffast-math", "-fopenmp", "-shared", "-fPIC", "-std=c++17", "-w")
 
 
 @functools.cache
-def library() -> ctypes.CDLL:
-    """Compile limit.cpp for this machine, once per version of it.
+def library(name: str) -> ctypes.CDLL:
+    """Compile `name`.cpp for this machine, once per version of it and of the headers beside it.
 
     Raises:
         RuntimeError: There is no g++, or it fails.
@@ -37,20 +37,22 @@ def library() -> ctypes.CDLL:
     compiler = shutil.which("g++")
     if compiler is None:
         raise RuntimeError("the limit is compiled on the spot and needs g++ with OpenMP; install it (Debian: g++)")
-    key = hashlib.sha256(SOURCE.read_bytes() + " ".join((*FLAGS, platform.node())).encode()).hexdigest()[:16]
+    source = FOLDER / f"{name}.cpp"
+    texts = [path.read_bytes() for path in (source, *sorted(FOLDER.glob("limit_*.h")))]
+    key = hashlib.sha256(b"".join(texts) + " ".join((*FLAGS, platform.node())).encode()).hexdigest()[:16]
     folder = Path(tempfile.gettempdir()) / f"sgwarp-limit-{os.getuid()}"
     folder.mkdir(mode=0o700, exist_ok=True)
-    target = folder / f"limit-{key}.so"
+    target = folder / f"{name}-{key}.so"
     if not target.exists():
-        fresh = folder / f"limit-{key}.{os.getpid()}.so"
-        done = subprocess.run([compiler, *FLAGS, str(SOURCE), "-o", str(fresh)], capture_output=True, text=True)
+        fresh = folder / f"{name}-{key}.{os.getpid()}.so"
+        done = subprocess.run([compiler, *FLAGS, str(source), "-o", str(fresh)], capture_output=True, text=True)
         if done.returncode:
-            raise RuntimeError(f"g++ could not compile {SOURCE}:\n{done.stderr}")
+            raise RuntimeError(f"g++ could not compile {source}:\n{done.stderr}")
         fresh.replace(target)
     return ctypes.CDLL(str(target))
 
 
-def _pointer(array: np.ndarray, dtype: type, shape: tuple[int, ...]) -> ctypes.c_void_p:
+def pointer(array: np.ndarray, dtype: type, shape: tuple[int, ...]) -> ctypes.c_void_p:
     right = array.dtype == dtype and array.shape == shape and array.flags.c_contiguous
     if not right:
         raise ValueError(f"expected contiguous {np.dtype(dtype)} {shape}, got {array.dtype} {array.shape}")
@@ -59,7 +61,7 @@ def _pointer(array: np.ndarray, dtype: type, shape: tuple[int, ...]) -> ctypes.c
 
 def _tiles(offsets: np.ndarray, ids: np.ndarray, width: int, height: int) -> tuple[ctypes.c_void_p, ctypes.c_void_p]:
     count = -(-width // 16) * -(-height // 16)
-    return _pointer(offsets, np.int32, (count + 1,)), _pointer(ids, np.int32, (len(ids),))
+    return pointer(offsets, np.int32, (count + 1,)), pointer(ids, np.int32, (len(ids),))
 
 
 def composite(
@@ -73,24 +75,29 @@ def composite(
     height: int,
     threads: int = 1,
     out: tuple[np.ndarray, np.ndarray] | None = None,
-) -> tuple[np.ndarray, np.ndarray]:
-    """Composite colours float32 [M, 3] over black: float32 [H, W, 3] and alpha [H, W]."""
+) -> tuple[np.ndarray, np.ndarray, float]:
+    """Composite colours float32 [M, 3] over black: float32 [H, W, 3], alpha [H, W] and the time taken [s].
+
+    The time does not hold the packing of the splats, which the package's tile lists have behind them.
+    """
     n, f = len(opacity), np.float32
     rgb, alpha = out or (np.empty((height, width, 3), f), np.empty((height, width), f))
-    library().composite(
+    run = library("limit").composite
+    run.restype = ctypes.c_double
+    seconds = run(
         n,
-        _pointer(mean2d, f, (n, 2)),
-        _pointer(conic, f, (n, 3)),
-        _pointer(opacity, f, (n,)),
-        _pointer(color, f, (n, 3)),
+        pointer(mean2d, f, (n, 2)),
+        pointer(conic, f, (n, 3)),
+        pointer(opacity, f, (n,)),
+        pointer(color, f, (n, 3)),
         width,
         height,
         *_tiles(offsets, ids, width, height),
         threads,
-        _pointer(rgb, f, (height, width, 3)),
-        _pointer(alpha, f, (height, width)),
+        pointer(rgb, f, (height, width, 3)),
+        pointer(alpha, f, (height, width)),
     )
-    return rgb, alpha
+    return rgb, alpha, seconds
 
 
 def lift_ids(
@@ -110,18 +117,18 @@ def lift_ids(
     """
     n, f, (height, width) = len(opacity), np.float32, image.shape
     out = np.zeros((n, channels), f) if out is None else out
-    library().lift_ids(
+    library("limit").lift_ids(
         n,
-        _pointer(mean2d, f, (n, 2)),
-        _pointer(conic, f, (n, 3)),
-        _pointer(opacity, f, (n,)),
+        pointer(mean2d, f, (n, 2)),
+        pointer(conic, f, (n, 3)),
+        pointer(opacity, f, (n,)),
         width,
         height,
         *_tiles(offsets, ids, width, height),
         threads,
-        _pointer(image, np.int32, (height, width)),
+        pointer(image, np.int32, (height, width)),
         channels,
-        _pointer(out, f, (n, channels)),
+        pointer(out, f, (n, channels)),
     )
     return out
 
@@ -142,19 +149,19 @@ def lift_dense(
     """
     n, f, (height, width, channels) = len(opacity), np.float32, image.shape
     features, weight = out or (np.zeros((n, channels), f), np.zeros(n, f))
-    library().lift_dense(
+    library("limit").lift_dense(
         n,
-        _pointer(mean2d, f, (n, 2)),
-        _pointer(conic, f, (n, 3)),
-        _pointer(opacity, f, (n,)),
+        pointer(mean2d, f, (n, 2)),
+        pointer(conic, f, (n, 3)),
+        pointer(opacity, f, (n,)),
         width,
         height,
         *_tiles(offsets, ids, width, height),
         threads,
-        _pointer(image, f, (height, width, channels)),
+        pointer(image, f, (height, width, channels)),
         channels,
-        _pointer(features, f, (n, channels)),
-        _pointer(weight, f, (n,)),
+        pointer(features, f, (n, channels)),
+        pointer(weight, f, (n,)),
     )
     return features, weight
 
@@ -180,7 +187,7 @@ def self_check(threads: int = 2) -> dict[str, float]:
     camera = camera.resized(101, 150)
     p = projected(gaussians, camera)
     raster = rasterize(gaussians, camera)
-    rgb, alpha = composite(p.mean2d, p.conic, p.opacity, p.color, p.offsets, p.ids, p.width, p.height, threads)
+    rgb, alpha, _ = composite(p.mean2d, p.conic, p.opacity, p.color, p.offsets, p.ids, p.width, p.height, threads)
     clear = ((raster.margin > 1e-4) & (raster.order_margin > 2e-6)).numpy()
     errors = {
         "image": float(np.abs(rgb - raster.features.numpy())[clear].max()),

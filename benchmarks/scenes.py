@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import torch
@@ -154,6 +154,13 @@ def room(n: int, seed: int = 0) -> tuple[Gaussians, Camera, np.ndarray]:
     quats = _facing(normals, rng.uniform(0, 2 * math.pi, n))
     gaussians = Gaussians(tensor(points), tensor(quats), tensor(scales), tensor(opacities), tensor(sh))
     return gaussians, room_camera(), labels[shuffle]
+
+
+def with_harmonics(gaussians: Gaussians, seed: int = 0) -> Gaussians:
+    """The same scene with small random coefficients of degree 3, as a trained scene has them."""
+    generator = torch.Generator().manual_seed(seed)
+    rest = 0.1 * torch.randn(len(gaussians), 15, 3, generator=generator)
+    return replace(gaussians, sh=torch.cat([gaussians.sh, rest], dim=1))
 
 
 def room_camera() -> Camera:

@@ -5,23 +5,28 @@ the intersections themselves are never sorted. On the CPU the counting pass runs
 slice counts its own tiles, prefix sums turn the counts into disjoint places, and each slice fills them. Any number of
 threads writes the same lists.
 
-On CUDA one thread per Gaussian emits its (tile, intersection) pairs in depth order; a stable radix sort by tile alone
-then gives the same lists, and one thread per place packs the fragment.
+On CUDA one thread per Gaussian emits its (tile, entry) pairs in depth order; a stable radix sort by tile alone then
+gives the same lists.
+
+A list holds ranks, places in the depth order, where the splats lie one to a line of the cache. Copies of the splats,
+tile by tile, could be read front to back, but cost more to write than that saves. A place is a position in the lists,
+an entry an intersection (one splat in one tile) counted splat by splat.
 """
 
 import warp as wp
 
-from sgwarp.kernels.gaussian import EXACT_OPTIONS, Splat, column_range, footprint, footprint_summit
+from sgwarp.kernels.gaussian import EXACT_OPTIONS, Splat, column_range
 from sgwarp.kernels.projection import VISIBLE
 
 wp.set_module_options(EXACT_OPTIONS)
 
 TILE = wp.constant(16)  # side of a tile [pixels]
+AHEAD = wp.constant(6)  # splats between the one at work and the one that is fetched: each is a line of its own
 
 
 @wp.struct
 class Fragment:
-    """A splat in one tile's list, packed so that compositing reads memory front to back."""
+    """A splat seen from one tile; made while a list is walked, and never stored."""
 
     x: float  # mean relative to the centre of the tile's first pixel [pixels]
     y: float
@@ -31,7 +36,6 @@ class Fragment:
     level: float
     depth: float  # [m]
     gaussian: int
-    entry: int  # place among all intersections when sorted by Gaussian
     first_row: int  # rows of the tile that the footprint may touch
     last_row: int
     color: wp.vec3
@@ -58,10 +62,10 @@ def box_columns(splat: Splat, width: int):
 
 
 @wp.func
-def tile_columns(splat: Splat, q: float, summit: float, row: int, width: int):
+def tile_columns(splat: Splat, row: int, width: int):
     """First and last tile column that the footprint touches within a tile row; empty if first > last."""
     top = float(row * TILE) + 0.5
-    left, right = column_range(splat, q, summit, top, top + float(TILE - 1))
+    left, right = column_range(splat, top, top + float(TILE - 1))
     first = int(wp.ceil(wp.clamp(left - 0.5, 0.0, float(width))))
     last = int(wp.floor(wp.clamp(right - 0.5, -1.0, float(width - 1))))
     if first > last:
@@ -70,127 +74,162 @@ def tile_columns(splat: Splat, q: float, summit: float, row: int, width: int):
 
 
 @wp.func
-def row_columns(splat: Splat, q: float, summit: float, row: int, width: int, box_first: int, box_last: int):
+def row_columns(splat: Splat, row: int, width: int, box_first: int, box_last: int):
     """`tile_columns`, without its square roots where the bounding box is one tile wide and not cut by the image."""
     first = box_first
     last = box_last
     cut = splat.mean[0] < splat.half_width or splat.mean[0] + splat.half_width > float(width)
     if box_first < box_last or cut:
-        first, last = tile_columns(splat, q, summit, row, width)
+        first, last = tile_columns(splat, row, width)
     return first, last
 
 
+@wp.func_native("""
+#if !defined(__CUDA_ARCH__)
+    if (i < splats.shape[0]) __builtin_prefetch(splats.data + i);
+#endif
+""")
+def prefetch(splats: wp.array[Splat], i: int): ...  # a hint for the CPU's cache
+
+
+@wp.func
+def row_range(splats: wp.array[Splat], rank: int, x: float):
+    """First and last dy of the footprint on a tile's 16 columns of pixel centres, the first of which lies x before it.
+
+    The lower border dy(dx) = (-a b dx + a c sqrt(w^2 - dx^2)) / (b^2 + c^2), w the half width, is concave: see
+    `column_range`.
+    """
+    b = splats[rank].b
+    c = splats[rank].c
+    inv_bc = splats[rank].inv_bc
+    half_width = splats[rank].half_width
+    lo = wp.max(-x, -half_width)
+    hi = wp.min(float(TILE - 1) - x, half_width)
+    summit = -half_width * b * inv_bc
+    at_bottom = wp.clamp(summit, lo, hi)
+    at_top = wp.clamp(-summit, lo, hi)
+    unit = splats[rank].a * inv_bc * inv_bc
+    w2 = half_width * half_width
+    bottom = (c * wp.sqrt(wp.max(w2 - at_bottom * at_bottom, 0.0)) - b * at_bottom) * unit
+    top = (-c * wp.sqrt(wp.max(w2 - at_top * at_top, 0.0)) - b * at_top) * unit
+    return top, bottom
+
+
+@wp.func
+def fragment_of(splats: wp.array[Splat], rank: int, x0: int, y0: int) -> Fragment:
+    """A splat relative to the tile whose first pixel is (x0, y0); fields are read one by one, as a copy costs more."""
+    fragment = Fragment()
+    fragment.x = splats[rank].mean[0] - float(x0) - 0.5
+    fragment.y = splats[rank].mean[1] - float(y0) - 0.5
+    fragment.a = splats[rank].a
+    fragment.b = splats[rank].b
+    fragment.c = splats[rank].c
+    fragment.level = splats[rank].level
+    fragment.depth = splats[rank].depth
+    fragment.gaussian = splats[rank].gaussian
+    top, bottom = row_range(splats, rank, fragment.x)
+    fragment.first_row = int(wp.ceil(wp.clamp(fragment.y + top, 0.0, float(TILE))))
+    fragment.last_row = int(wp.floor(wp.clamp(fragment.y + bottom, -1.0, float(TILE - 1))))
+    fragment.color = splats[rank].color
+    return fragment
+
+
+@wp.func
+def order_splat(
+    rank: int,
+    order: wp.array[int],
+    splats: wp.array[Splat],
+    colors: wp.array[wp.vec3],
+    ordered_out: wp.array[Splat],
+):
+    """Bring a splat to its place in the depth order, with its Gaussian and, where colours travel along, its colour."""
+    ordered_out[rank] = splats[order[rank]]
+    ordered_out[rank].gaussian = order[rank]
+    if colors.shape[0] > 0:
+        ordered_out[rank].color = colors[rank]
+
+
 @wp.kernel
-def gather_splats(
+def order_splats(
     # In:
-    base: int,  # first entry of `order` in this launch
-    order: wp.array[int],  # [V] Gaussians by (depth, index)
+    base: int,  # first rank of this launch
+    order: wp.array[int],  # [V] Gaussians
     splats: wp.array[Splat],  # [N]
+    colors: wp.array[wp.vec3],  # [V] or empty
     # Out:
     ordered_out: wp.array[Splat],  # [V]
 ):
-    """Bring the splats into depth order: later passes then read memory front to back instead of waiting for it."""
-    k = base + wp.tid()
-    ordered_out[k] = splats[order[k]]
+    """Bring the splats into a given order, for lists that were made elsewhere; `count_tiles` does it on its way."""
+    order_splat(base + wp.tid(), order, splats, colors, ordered_out)
 
 
 @wp.kernel
 def count_tiles(
     # In:
     base: int,  # first slice of this launch
-    splats: wp.array[Splat],  # [V] visible, by (depth, index)
+    order: wp.array[int],  # [V] visible Gaussians by (depth, index)
+    splats: wp.array[Splat],  # [N]
+    colors: wp.array[wp.vec3],  # [V] or empty
     per_slice: int,  # splats in a slice
     width: int,  # [pixels]
     height: int,
-    alpha_min_level: float,
     # Out:
+    ordered_out: wp.array[Splat],  # [V] in depth order, where all later passes read them
     tile_counts_out: wp.array2d[int],  # [slices, tiles] zeroed
     splat_counts_out: wp.array[int],  # [V] tiles that each splat touches
 ):
-    """Count intersections per (slice, tile) and per Gaussian. One thread per slice."""
+    """Bring the splats into depth order and count intersections per (slice, tile) and splat. One thread per slice."""
     s = base + wp.tid()
     columns = (width + TILE - 1) / TILE
-    for k in range(s * per_slice, wp.min((s + 1) * per_slice, splats.shape[0])):
-        splat = splats[k]
-        q = footprint(splat, alpha_min_level)
-        summit = footprint_summit(splat, q)
+    for k in range(s * per_slice, wp.min((s + 1) * per_slice, order.shape[0])):
+        prefetch(splats, order[wp.min(k + AHEAD, order.shape[0] - 1)])
+        order_splat(k, order, splats, colors, ordered_out)
+        splat = splats[order[k]]
         box_first, box_last = box_columns(splat, width)
         total = int(0)
         first_row, last_row = tile_rows(splat, height)
         for row in range(first_row, last_row + 1):
-            first, last = row_columns(splat, q, summit, row, width, box_first, box_last)
+            first, last = row_columns(splat, row, width, box_first, box_last)
             for column in range(first, last + 1):
                 tile_counts_out[s, row * columns + column] += 1
             total += wp.max(last - first + 1, 0)
         splat_counts_out[k] = total
 
 
-@wp.func
-def fragment_of(splat: Splat, gaussian: int) -> Fragment:
-    """What all fragments of a splat share."""
-    fragment = Fragment()
-    fragment.a = splat.a
-    fragment.b = splat.b
-    fragment.c = splat.c
-    fragment.level = splat.level
-    fragment.depth = splat.depth
-    fragment.gaussian = gaussian
-    return fragment
-
-
-@wp.func
-def in_tile_row(fragment: Fragment, splat: Splat, row: int) -> Fragment:
-    """The fragment relative to one row of tiles."""
-    fragment.y = splat.mean[1] - float(row * TILE) - 0.5
-    fragment.first_row = int(wp.ceil(wp.clamp(fragment.y - splat.half_height, 0.0, float(TILE))))
-    fragment.last_row = int(wp.floor(wp.clamp(fragment.y + splat.half_height, -1.0, float(TILE - 1))))
-    return fragment
-
-
 @wp.kernel
 def fill_tiles(
     # In:
     base: int,
-    order: wp.array[int],  # [V]
-    splats: wp.array[Splat],  # [V]
-    colors: wp.array[wp.vec3],  # [V] or empty
+    splats: wp.array[Splat],  # [V] in depth order
     per_slice: int,
     width: int,
     height: int,
-    alpha_min_level: float,
-    entries: wp.array[int],  # [V] first intersection of each entry, by Gaussian
+    entries: wp.array[int],  # [V] first entry of each splat
     # In and out:
     cursors: wp.array2d[int],  # [slices, tiles] next free place of each (slice, tile)
     # Out:
-    fragments_out: wp.array[Fragment],  # [I] tile by tile, front to back
-    places_out: wp.array[int],  # [I] position in the tile lists of each intersection, by Gaussian; or empty
-    tiles_out: wp.array[int],  # [I] its tile; or empty
+    listed_out: wp.array[int],  # [I] ranks of the splats, tile by tile, front to back
+    places_out: wp.array[int],  # [I] place of each entry; or empty
+    tiles_out: wp.array[int],  # [I] tile of each entry; or empty
 ):
     """Write the tile lists. One thread per slice; the cursors keep slices apart."""
     s = base + wp.tid()
     columns = (width + TILE - 1) / TILE
-    for k in range(s * per_slice, wp.min((s + 1) * per_slice, order.shape[0])):
+    for k in range(s * per_slice, wp.min((s + 1) * per_slice, splats.shape[0])):
         splat = splats[k]
-        q = footprint(splat, alpha_min_level)
-        summit = footprint_summit(splat, q)
         box_first, box_last = box_columns(splat, width)
-        fragment = fragment_of(splat, order[k])
-        if colors.shape[0] > 0:
-            fragment.color = colors[k]
         entry = entries[k]
         first_row, last_row = tile_rows(splat, height)
         for row in range(first_row, last_row + 1):
-            first, last = row_columns(splat, q, summit, row, width, box_first, box_last)
-            fragment = in_tile_row(fragment, splat, row)
+            first, last = row_columns(splat, row, width, box_first, box_last)
             for column in range(first, last + 1):
                 tile = row * columns + column
                 place = cursors[s, tile]
                 cursors[s, tile] = place + 1
-                fragment.x = splat.mean[0] - float(column * TILE) - 0.5
-                fragment.entry = entry
-                fragments_out[place] = fragment
+                listed_out[place] = k
                 if places_out.shape[0] > 0:
                     places_out[entry] = place
+                if tiles_out.shape[0] > 0:
                     tiles_out[entry] = tile
                 entry += 1
 
@@ -199,25 +238,26 @@ def fill_tiles(
 def count_splat_tiles(
     # In:
     order: wp.array[int],  # [V] Gaussians by (depth, index), the culled last
-    splats: wp.array[Splat],  # [V]
+    splats: wp.array[Splat],  # [N]
+    colors: wp.array[wp.vec3],  # [V] or empty
     status: wp.array[wp.uint8],  # [N]
     width: int,
     height: int,
-    alpha_min_level: float,
     # Out:
+    ordered_out: wp.array[Splat],  # [V] in depth order
     splat_counts_out: wp.array[int],  # [V] tiles that each splat touches
 ):
-    """Count intersections per Gaussian (CUDA)."""
+    """Bring the splats into depth order and count their intersections (CUDA)."""
     k = wp.tid()
     total = int(0)
     if int(status[order[k]]) == VISIBLE:
-        splat = splats[k]
-        q = footprint(splat, alpha_min_level)
-        summit = footprint_summit(splat, q)
+        prefetch(splats, order[wp.min(k + AHEAD, order.shape[0] - 1)])
+        order_splat(k, order, splats, colors, ordered_out)
+        splat = splats[order[k]]
         box_first, box_last = box_columns(splat, width)
         first_row, last_row = tile_rows(splat, height)
         for row in range(first_row, last_row + 1):
-            first, last = row_columns(splat, q, summit, row, width, box_first, box_last)
+            first, last = row_columns(splat, row, width, box_first, box_last)
             total += wp.max(last - first + 1, 0)
     splat_counts_out[k] = total
 
@@ -225,31 +265,26 @@ def count_splat_tiles(
 @wp.kernel
 def emit_tiles(
     # In:
-    order: wp.array[int],  # [V]
-    splats: wp.array[Splat],  # [V]
-    status: wp.array[wp.uint8],  # [N]
+    splats: wp.array[Splat],  # [V] in depth order
     width: int,
     height: int,
-    alpha_min_level: float,
-    entries: wp.array[int],  # [V] first intersection of each entry
+    entries: wp.array[int],  # [V + 1] first entry of each splat; the culled have none
     # Out:
-    tiles_out: wp.array[int],  # [I] sort key
-    intersections_out: wp.array[int],  # [I] sort value
-    ranks_out: wp.array[int],  # [I] place in `order`
+    tiles_out: wp.array[int],  # [I] tile of each entry, the sort key
+    intersections_out: wp.array[int],  # [I] the entry itself, the sort value
+    ranks_out: wp.array[int],  # [I] rank of each entry
 ):
-    """List the tiles of each Gaussian, row by row (CUDA)."""
+    """List the tiles of each splat, row by row (CUDA)."""
     k = wp.tid()
-    if int(status[order[k]]) != VISIBLE:
+    entry = entries[k]
+    if entries[k + 1] == entry:
         return
     columns = (width + TILE - 1) / TILE
     splat = splats[k]
-    q = footprint(splat, alpha_min_level)
-    summit = footprint_summit(splat, q)
     box_first, box_last = box_columns(splat, width)
-    entry = entries[k]
     first_row, last_row = tile_rows(splat, height)
     for row in range(first_row, last_row + 1):
-        first, last = row_columns(splat, q, summit, row, width, box_first, box_last)
+        first, last = row_columns(splat, row, width, box_first, box_last)
         for column in range(first, last + 1):
             tiles_out[entry] = row * columns + column
             intersections_out[entry] = entry
@@ -258,30 +293,16 @@ def emit_tiles(
 
 
 @wp.kernel
-def pack_fragments(
+def list_sorted(
     # In:
-    sorted_tiles: wp.array[int],  # [I]
-    sorted_intersections: wp.array[int],  # [I]
-    ranks: wp.array[int],  # [I] place in `order`, by intersection
-    order: wp.array[int],  # [V]
-    splats: wp.array[Splat],  # [V]
-    colors: wp.array[wp.vec3],  # [V] or empty
-    width: int,
+    sorted_intersections: wp.array[int],  # [I] entries, by place
+    ranks: wp.array[int],  # [I] rank of each entry
     # Out:
-    fragments_out: wp.array[Fragment],  # [I]
-    places_out: wp.array[int],  # [I] position in the tile lists of each intersection
+    listed_out: wp.array[int],  # [I] ranks of the splats, tile by tile, front to back
+    places_out: wp.array[int],  # [I] place of each entry
 ):
-    """Pack the sorted intersections (CUDA). One thread per place."""
+    """Read the lists off the sorted intersections (CUDA). One thread per place."""
     place = wp.tid()
-    tile = sorted_tiles[place]
     entry = sorted_intersections[place]
-    k = ranks[entry]
-    columns = (width + TILE - 1) / TILE
-    splat = splats[k]
-    fragment = in_tile_row(fragment_of(splat, order[k]), splat, tile / columns)
-    fragment.x = splat.mean[0] - float((tile % columns) * TILE) - 0.5
-    fragment.entry = entry
-    if colors.shape[0] > 0:
-        fragment.color = colors[k]
-    fragments_out[place] = fragment
+    listed_out[place] = ranks[entry]
     places_out[entry] = place

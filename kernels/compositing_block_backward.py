@@ -2,17 +2,18 @@
 
 The mathematics is that of `compositing_lanes_backward.py`. For a batch of 16 fragments each thread computes w and g at
 its own pixel, then thread (fragment, column) sums one column of the fragment's row over the 256 pixels. The sum goes to
-the Gaussian by one atomic addition per (tile, fragment, column) or, in the ordered variant, to the row of its
-intersection, which `projection_backward.sum_intersections` adds up in a fixed order.
+the Gaussian by one atomic addition per (tile, fragment, column) or, in the ordered variant, to the row of its place in
+the lists; `projection_backward.sum_intersections` adds the rows up in a fixed order.
 """
 
 from functools import cache
 
 import warp as wp
 
-from sgwarp.kernels.binning import TILE, Fragment
-from sgwarp.kernels.compositing_block import BLOCK, alpha_at
+from sgwarp.kernels.binning import TILE
+from sgwarp.kernels.compositing_block import BLOCK, alpha_at, whitened
 from sgwarp.kernels.compositing_lanes_backward import MIN_PASSED, MOMENTS, row_columns
+from sgwarp.kernels.gaussian import Splat
 from sgwarp.kernels.projection import Knobs
 from sgwarp.kernels.projection_backward import SEEN
 from sgwarp.kernels.transmittance import BLOCK_OPTIONS, LANES, Lanes
@@ -39,26 +40,27 @@ def make_composite_backward_block(wide: bool, depth: bool, absolute: bool, order
     def composite_backward_block(
         # In:
         offsets: wp.array[int],  # [tiles + 1]
-        fragments: wp.array[Fragment],  # [I]
+        listed: wp.array[int],  # [I]
+        splats: wp.array[Splat],  # [V]
         features: wp.array2d[Lanes],  # [N, S] channels in slices of 16 (wide)
         transmittance: wp.array2d[float],  # [H, W]
         v_transmittance: wp.array2d[float],  # [H, W] its gradient
         v_image: wp.array3d[float],  # [H, W, C] gradient of the image
         v_depth: wp.array2d[float],  # [H, W] gradient of the depth sum (depth)
-        last: wp.array2d[int],  # [H, W] last contributing fragment, counted from its tile's first
+        last: wp.array2d[int],  # [H, W] last contributor, counted from its tile's first, -1 = none
         knobs: Knobs,
         width: int,
         height: int,
         # Out:
-        rows_out: wp.array2d[float],  # [I, 16] by intersection (ordered), or [N, 16] added to
+        rows_out: wp.array2d[float],  # [I, 16] by place (ordered), or [N, 16] added to
     ):
         """Paper eq. 1, differentiated; one block per tile."""
         tile, t = wp.tid()
         columns = (width + TILE - 1) / TILE
-        column = t % TILE
-        row = t / TILE
-        x = (tile % columns) * TILE + column
-        y = (tile / columns) * TILE + row
+        x0 = (tile % columns) * TILE
+        y0 = (tile / columns) * TILE
+        x = x0 + t % TILE
+        y = y0 + t / TILE
         inside = x < width and y < height
         T = float(1.0)
         behind = float(0.0)
@@ -86,12 +88,13 @@ def make_composite_backward_block(wide: bool, depth: bool, absolute: bool, order
         if wp.static(ordered):
             for k in range(first + count + t, offsets[tile + 1], BLOCK):
                 for e in range(LANES):
-                    rows_out[fragments[k].entry, e] = 0.0
+                    rows_out[k, e] = 0.0
         for done in range(0, count, BATCH):
             start = wp.max(count - done - BATCH, 0)  # counted from the tile's first fragment
             size = count - done - start
             # The barriers of this load and of the assignments below keep readers and writers of `shares` apart.
-            staged = wp.tile_load(fragments, shape=BATCH, offset=first + start, storage="shared")
+            ranks = wp.tile_load(listed, shape=BATCH, offset=first + start, storage="shared")
+            staged = wp.tile_load_indexed(splats, indices=ranks, shape=(BATCH,), storage="shared")
             values = Lanes(0.0)
             if wp.static(wide) and inside:
                 for s in range(features.shape[1]):
@@ -106,7 +109,7 @@ def make_composite_backward_block(wide: bool, depth: bool, absolute: bool, order
                 b = wp.static(BATCH - 1) - step
                 if b < size:
                     f = staged[b]
-                    alpha = wp.where(start + b <= latest, alpha_at(f, column, row, knobs), 0.0)
+                    alpha = wp.where(start + b <= latest, alpha_at(f, x, y, knobs), 0.0)
                     T = T / wp.max(1.0 - alpha, MIN_PASSED)
                     w = alpha * T
                     value = values[b] + f.color[0] * v_pixel[0] + f.color[1] * v_pixel[1] + f.color[2] * v_pixel[2]
@@ -129,8 +132,7 @@ def make_composite_backward_block(wide: bool, depth: bool, absolute: bool, order
                 total = float(0.0)
                 for step in range(BLOCK):
                     p = (step + q) % BLOCK  # start apart, so that 16 columns read 16 banks
-                    v = f.c * (float(p / TILE) - f.y)
-                    u = f.b * (float(p / TILE) - f.y) + f.a * (float(p % TILE) - f.x)
+                    u, v = whitened(f, x0 + p % TILE, y0 + p / TILE)
                     factor = wp.where(is_moment, moment(q, u, v), planes[plane, p])
                     if wp.static(absolute):
                         slope = wp.where(q == at_absolute, f.a * u, f.b * u + f.c * v)
@@ -140,7 +142,7 @@ def make_composite_backward_block(wide: bool, depth: bool, absolute: bool, order
                     else:
                         total += shares[source, p] * factor
                 if wp.static(ordered):
-                    rows_out[f.entry, q] = total
+                    rows_out[first + start + j, q] = total
                 else:
                     wp.atomic_add(rows_out, f.gaussian, q, total)
             if wp.static(not ordered) and j < size and q == SEEN:

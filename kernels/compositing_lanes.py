@@ -1,6 +1,6 @@
 """Front-to-back compositing, lane schedule (CPU): a thread owns a tile, 16 pixels of one of its rows are one vector.
 
-Every kernel walks a tile's fragments front to back and, for each, only the rows its footprint touches. The state of a
+Every kernel walks a tile's list front to back and, for each, only the rows its footprint touches. The state of a
 row (transmittance, accumulated channels) lives in a small scratch that stays in the first-level cache; `slot` names
 the scratch of the host thread that runs the launch.
 """
@@ -9,7 +9,9 @@ from functools import cache
 
 import warp as wp
 
-from sgwarp.kernels.binning import TILE, Fragment
+from sgwarp.kernels.binning import AHEAD, TILE, Fragment, fragment_of, prefetch
+from sgwarp.kernels.compositing_rows import row_walk
+from sgwarp.kernels.gaussian import Splat
 from sgwarp.kernels.projection import Knobs
 from sgwarp.kernels.transmittance import (
     HALF_ROW,
@@ -24,6 +26,7 @@ from sgwarp.kernels.transmittance import (
 
 wp.set_module_options(LANE_OPTIONS)
 
+BATCH = wp.constant(32)  # fragments that are walked row by row
 CLOSE_EVERY = wp.constant(32)  # fragments between two looks at which rows are closed
 
 
@@ -95,23 +98,29 @@ def still_open(mask: int, state: wp.array3d[Lanes], slot: int) -> int:
 
 @cache
 def color_walk(depth: bool, record: bool) -> wp.Function:
-    """Device function that composites a tile's three packed channels into its scratch.
+    """Device function that composites the three channels that travel with the splats into a tile's scratch.
+
+    Fragments come in batches, and row by row those that reach it are composited.
 
     Planes of the scratch: transmittance, three channels, with `depth` sum of alpha T z and the surface depth, with
-    `record` the last contributing fragment. With both, the surface is kept as a fragment, not as a depth.
+    `record` the last contributor. With both, the surface is kept as a contributor, not as a depth.
     """
     planes = color_planes(depth, record)
+    composite_row = row_walk(depth, record)
 
     @wp.func
     def walk(
         tile: int,
         slot: int,
         offsets: wp.array[int],
-        fragments: wp.array[Fragment],
+        listed: wp.array[int],
+        splats: wp.array[Splat],
         knobs: Knobs,
         width: int,
         height: int,
         state: wp.array3d[Lanes],
+        batch: wp.array2d[Fragment],
+        reached: wp.array3d[int],
     ):
         columns = (width + TILE - 1) / TILE
         x0 = (tile % columns) * TILE
@@ -126,36 +135,23 @@ def color_walk(depth: bool, record: bool) -> wp.Function:
                     state[slot, row, 5] = Lanes(-1.0)
         open_rows = open_row_mask(y0, height)
         first = offsets[tile]
-        for k in range(first, offsets[tile + 1]):
-            f = fragments[k]
-            for row in range(f.first_row, f.last_row + 1):
-                if row_is_reached(f, row, knobs) and (open_rows >> row) & 1 != 0:
-                    T = state[slot, row, 0]
-                    alphas = lane_alphas(f, row, knobs)
-                    w = lane_contributions(alphas, T, knobs)
-                    state[slot, row, 0] = lane_attenuated(alphas, T, knobs)
-                    state[slot, row, 1] = state[slot, row, 1] + w * f.color[0]
-                    state[slot, row, 2] = state[slot, row, 2] + w * f.color[1]
-                    state[slot, row, 3] = state[slot, row, 3] + w * f.color[2]
-                    if wp.static(record):
-                        state[slot, row, wp.static(planes - 1)] = latest(
-                            w, float(k - first), state[slot, row, wp.static(planes - 1)]
-                        )
-                    if wp.static(depth):
-                        state[slot, row, 4] = state[slot, row, 4] + w * f.depth
-                        surface = state[slot, row, 5]
-                        found = f.depth
-                        if wp.static(record):
-                            found = float(k - first)
-                        for i in range(LANES):
-                            behind = T[i] - w[i]
-                            here = wp.where(behind <= knobs.surface_transmittance, found, surface[i])
-                            surface[i] = wp.where(T[i] > knobs.surface_transmittance, here, surface[i])
-                        state[slot, row, 5] = surface
-            if (k - first) % CLOSE_EVERY == CLOSE_EVERY - 1:
-                open_rows = still_open(open_rows, state, slot)
-                if open_rows == 0:
-                    break
+        stop = offsets[tile + 1]
+        for start in range(first, stop, BATCH):
+            size = wp.min(BATCH, stop - start)
+            for b in range(size):
+                prefetch(splats, listed[wp.min(start + b + AHEAD, stop - 1)])
+                f = fragment_of(splats, listed[start + b], x0, y0)
+                batch[slot, b] = f
+                reached[slot, 0, b] = f.first_row
+                reached[slot, 1, b] = f.last_row
+            for b in range(size, BATCH):
+                reached[slot, 1, b] = -1
+            for row in range(TILE):
+                if (open_rows >> row) & 1 != 0:
+                    composite_row(slot, row, start - first, batch, reached, knobs, state)
+            open_rows = still_open(open_rows, state, slot)
+            if open_rows == 0:
+                break
 
     return walk
 
@@ -167,11 +163,29 @@ def color_planes(depth: bool, record: bool) -> int:
 
 @wp.func
 def latest(w: Lanes, k: float, last: Lanes) -> Lanes:
-    """k in the lanes to which its fragment contributes. Floats count exactly to 2^24 fragments of one tile."""
+    """k in the lanes to which its fragment contributes. Floats count exactly to 2^24 places of one tile."""
     newest = last
     for i in range(LANES):
         newest[i] = wp.where(w[i] > 0.0, k, last[i])
     return newest
+
+
+@wp.func
+def write_last(
+    slot: int,
+    x0: int,
+    y0: int,
+    width: int,
+    height: int,
+    state: wp.array3d[Lanes],
+    plane: int,
+    last_out: wp.array2d[int],
+):
+    """Last contributors of a tile, from lanes to pixels."""
+    for row in range(wp.min(TILE, height - y0)):
+        last = state[slot, row, plane]
+        for i in range(wp.min(LANES, width - x0)):
+            last_out[y0 + row, x0 + i] = int(last[i])
 
 
 @wp.func
@@ -197,46 +211,67 @@ def write_colors(
 
 
 @cache
-def make_composite_colors(depth: bool) -> wp.Kernel:
-    """Kernel that composites three packed channels; with `depth` also sum of alpha T z and the surface depth."""
-    walk = color_walk(depth, False)
+def make_composite_colors(depth: bool, record: bool) -> wp.Kernel:
+    """Kernel that composites three channels that travel with the splats.
+
+    Args:
+        depth: Also write the sum of alpha T z and the surface depth.
+        record: Also write what the backward pass starts from.
+    """
+    walk = color_walk(depth, record)
+    last_plane = color_planes(depth, record) - 1
 
     @wp.kernel(module="unique", module_options=LANE_OPTIONS, enable_backward=False)
     def composite_colors(
         # In:
         base: int,  # first tile of this launch
         slot: int,  # scratch of this launch
-        offsets: wp.array[int],  # [tiles + 1] first fragment of each tile
-        fragments: wp.array[Fragment],  # [I]
+        offsets: wp.array[int],  # [tiles + 1] first place of each tile
+        listed: wp.array[int],  # [I] ranks, tile by tile, front to back
+        splats: wp.array[Splat],  # [V] in depth order
         knobs: Knobs,
         width: int,  # [pixels]
         height: int,
         state: wp.array3d[Lanes],  # [slots, 16, planes] scratch
+        batch: wp.array2d[Fragment],  # [slots, BATCH] scratch
+        reached: wp.array3d[int],  # [slots, 2, BATCH] scratch: first and last row of each
         # Out:
         colors_out: wp.array2d[wp.vec3],  # [H, W] sum of alpha T color
         transmittance_out: wp.array2d[float],  # [H, W]
-        depth_sum_out: wp.array2d[float],  # [H, W] sum of alpha T z [m]
-        surface_out: wp.array2d[float],  # [H, W] z where accumulated opacity passes alpha_d [m], 0 = no hit
+        depth_sum_out: wp.array2d[float],  # [H, W] sum of alpha T z [m] (depth)
+        surface_out: wp.array2d[float],  # [H, W] z where accumulated opacity passes alpha_d [m], 0 = no hit (depth)
+        last_out: wp.array2d[int],  # [H, W] last contributor, counted from its tile's first, -1 = none (record)
+        hit_out: wp.array2d[int],  # [H, W] Gaussian of `surface_out`, -1 = no hit (depth and record)
     ):
         """Paper eq. 1 for one tile per thread."""
         tile = base + wp.tid()
         columns = (width + TILE - 1) / TILE
         x0 = (tile % columns) * TILE
         y0 = (tile / columns) * TILE
-        walk(tile, slot, offsets, fragments, knobs, width, height, state)
+        walk(tile, slot, offsets, listed, splats, knobs, width, height, state, batch, reached)
         write_colors(slot, x0, y0, width, height, state, colors_out, transmittance_out)
+        if wp.static(record):
+            write_last(slot, x0, y0, width, height, state, last_plane, last_out)
         if wp.static(depth):
             for row in range(wp.min(TILE, height - y0)):
                 z = state[slot, row, 4]
                 surface = state[slot, row, 5]
                 for i in range(wp.min(LANES, width - x0)):
                     depth_sum_out[y0 + row, x0 + i] = z[i]
-                    surface_out[y0 + row, x0 + i] = surface[i]
+                    d = surface[i]
+                    if wp.static(record):
+                        hit = int(-1)
+                        d = float(0.0)
+                        if surface[i] >= 0.0:
+                            splat = splats[listed[offsets[tile] + int(surface[i])]]
+                            d = splat.depth
+                            hit = splat.gaussian
+                        hit_out[y0 + row, x0 + i] = hit
+                    surface_out[y0 + row, x0 + i] = d
 
     return composite_colors
 
 
-BATCH = wp.constant(32)  # fragments whose weights are kept before they are multiplied by their features
 PASS = 16  # channels accumulated in registers at a time
 Accumulator = wp.types.matrix(shape=(PASS, LANES), dtype=wp.float32)
 
@@ -270,7 +305,7 @@ def add_products(
 def feature_walk(slices: int, record: bool) -> wp.Function:
     """Device function that composites 16 `slices` channels of a tile into its scratch.
 
-    Planes of the scratch: transmittance, the channels, with `record` the last contributing fragment.
+    Planes of the scratch: transmittance, the channels, with `record` the last contributor.
     """
     last_plane = 1 + PASS * slices
 
@@ -279,7 +314,8 @@ def feature_walk(slices: int, record: bool) -> wp.Function:
         tile: int,
         slot: int,
         offsets: wp.array[int],
-        fragments: wp.array[Fragment],
+        listed: wp.array[int],
+        splats: wp.array[Splat],
         features: wp.array3d[Lanes],
         first_slice: int,
         knobs: Knobs,
@@ -309,7 +345,7 @@ def feature_walk(slices: int, record: bool) -> wp.Function:
                     count = int(0)
                     T = state[slot, row, 0]
                     for k in range(start, end):
-                        f = fragments[k]
+                        f = fragment_of(splats, listed[k], x0, y0)
                         if row_is_reached(f, row, knobs):
                             alphas = lane_alphas(f, row, knobs)
                             w = lane_contributions(alphas, T, knobs)
@@ -360,9 +396,9 @@ def feature_writer(slices: int) -> wp.Function:
 
 
 @cache
-def make_composite_features(slices: int) -> wp.Kernel:
-    """Kernel that composites passes of `16 slices` channels."""
-    walk = feature_walk(slices, False)
+def make_composite_features(slices: int, record: bool) -> wp.Kernel:
+    """Kernel that composites passes of `16 slices` channels; with `record` also what the backward pass starts from."""
+    walk = feature_walk(slices, record)
     write = feature_writer(slices)
 
     @wp.kernel(module="unique", module_options=LANE_OPTIONS, enable_backward=False)
@@ -371,25 +407,29 @@ def make_composite_features(slices: int) -> wp.Kernel:
         base: int,
         slot: int,
         offsets: wp.array[int],  # [tiles + 1]
-        fragments: wp.array[Fragment],  # [I]
+        listed: wp.array[int],  # [I]
+        splats: wp.array[Splat],  # [V]
         features: wp.array3d[Lanes],  # [N, S, 1] channels in slices of 16
         first_slice: int,  # of this pass
         knobs: Knobs,
         width: int,
         height: int,
-        state: wp.array3d[Lanes],  # [slots, 16, 1 + 16 slices] scratch
+        state: wp.array3d[Lanes],  # [slots, 16, 1 + 16 slices (+ 1)] scratch
         weights: wp.array3d[Lanes],  # [slots, 16, BATCH] scratch
         owners: wp.array3d[int],  # [slots, 16, BATCH] scratch
         # Out:
         features_out: wp.array3d[float],  # [H, W, C] sum of alpha T x
         transmittance_out: wp.array2d[float],  # [H, W]
+        last_out: wp.array2d[int],  # [H, W] last contributor, counted from its tile's first, -1 = none (record)
     ):
         """Paper eq. 1 for any number of channels."""
         tile = base + wp.tid()
         columns = (width + TILE - 1) / TILE
         x0 = (tile % columns) * TILE
         y0 = (tile / columns) * TILE
-        walk(tile, slot, offsets, fragments, features, first_slice, knobs, width, height, state, weights, owners)
+        walk(tile, slot, offsets, listed, splats, features, first_slice, knobs, width, height, state, weights, owners)
         write(slot, x0, y0, first_slice, width, height, state, features_out, transmittance_out)
+        if wp.static(record):
+            write_last(slot, x0, y0, width, height, state, wp.static(1 + PASS * slices), last_out)
 
     return composite_features

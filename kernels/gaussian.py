@@ -1,4 +1,4 @@
-"""Device functions of one Gaussian: camera frame, projected covariance, footprint, alpha.
+"""Device functions of one Gaussian: camera frame, projected covariance, footprint.
 
 Conventions: OpenCV camera axes (x right, y down, z forward), quaternions (w, x, y, z), pixel centres at .5.
 
@@ -18,6 +18,7 @@ EXACT_OPTIONS = {
 wp.set_module_options(EXACT_OPTIONS)
 
 LOG2_E = wp.constant(1.4426950408889634)
+UNIT = wp.constant(0.8493218002880191)  # sqrt(log2(e) / 2): makes the exponent of a footprint a power of two
 MIN_QUAT_NORM2 = wp.constant(1.0e-6)  # |q|^2 below this has no direction
 LEVEL_SLACK = wp.constant(1.0e-4)  # widens footprints by this many powers of two: culling errs on the safe side
 
@@ -41,7 +42,10 @@ class Pinhole:
 
 @wp.struct
 class Splat:
-    """A projected Gaussian: alpha(dx, dy) = 2^(level - u^2 - v^2), u = a dx + b dy, v = c dy."""
+    """A projected Gaussian: alpha(dx, dy) = 2^(level - u^2 - v^2), u = a dx + b dy, v = c dy.
+
+    64 bytes, one line of the cache. The last fields are filled in once the splats lie in depth order.
+    """
 
     mean: wp.vec2  # [pixels]
     a: float
@@ -51,26 +55,31 @@ class Splat:
     depth: float  # z in the camera frame [m]
     half_width: float  # of the footprint {alpha >= alpha_min} [pixels]
     half_height: float
+    reach: float  # the footprint is u^2 + v^2 <= reach
+    summit: float  # dy at which its right border is furthest right [pixels]
+    inv_bc: float  # 1 / sqrt(b^2 + c^2) [pixels]
+    gaussian: int
+    color: wp.vec3
 
 
 @wp.func
 def rotation_from_quaternion(q: wp.vec4) -> wp.mat33:
     """Rotation matrix of q = (w, x, y, z), which need not be normalised."""
-    n = q / wp.length(q)
-    w = n[0]
-    x = n[1]
-    y = n[2]
-    z = n[3]
+    s = 2.0 / wp.dot(q, q)
+    x = s * q[1]
+    y = s * q[2]
+    z = s * q[3]
+    wx = x * q[0]
+    wy = y * q[0]
+    wz = z * q[0]
+    xx = x * q[1]
+    xy = x * q[2]
+    xz = x * q[3]
+    yy = y * q[2]
+    yz = y * q[3]
+    zz = z * q[3]
     return wp.mat33(
-        1.0 - 2.0 * (y * y + z * z),
-        2.0 * (x * y - w * z),
-        2.0 * (x * z + w * y),
-        2.0 * (x * y + w * z),
-        1.0 - 2.0 * (x * x + z * z),
-        2.0 * (y * z - w * x),
-        2.0 * (x * z - w * y),
-        2.0 * (y * z + w * x),
-        1.0 - 2.0 * (x * x + y * y),
+        1.0 - (yy + zz), xy - wz, xz + wy, xy + wz, 1.0 - (xx + zz), yz - wx, xz - wy, yz + wx, 1.0 - (xx + yy)
     )
 
 
@@ -108,33 +117,30 @@ def factor_determinant(m_x: wp.vec3, m_y: wp.vec3) -> float:
 
 
 @wp.func
-def footprint(splat: Splat, alpha_min_level: float) -> float:
-    """q such that alpha >= alpha_min where u^2 + v^2 <= q."""
-    return splat.level - alpha_min_level + LEVEL_SLACK
+def footprint_factor(xy: float, yy: float, determinant: float):
+    """(a, b, c) of a splat: Cholesky rows of the conic of its dilated covariance, scaled by `UNIT`."""
+    inv_y = 1.0 / wp.sqrt(yy)
+    inv_root = 1.0 / wp.sqrt(determinant)
+    scaled = UNIT * inv_y * inv_root
+    return scaled * yy, -scaled * xy, UNIT * inv_y
 
 
 @wp.func
-def footprint_summit(splat: Splat, q: float) -> float:
-    """dy at which the right border of the footprint is furthest right [pixels]."""
-    return -splat.b * wp.sqrt(q / (splat.b * splat.b + splat.c * splat.c)) / splat.c
-
-
-@wp.func
-def column_range(splat: Splat, q: float, summit: float, y_first: float, y_last: float):
+def column_range(splat: Splat, y_first: float, y_last: float):
     """Exact range of x [pixels] that the footprint covers between two heights; empty if first > second.
 
-    The right border x(y) = (-b y + sqrt(q - c^2 y^2)) / a is concave, so its largest value over a band lies at the
+    The right border x(y) = (-b y + sqrt(reach - c^2 y^2)) / a is concave, so its largest value over a band lies at the
     summit or at the end of the band nearest to it; the left border mirrors it.
     """
     lo = wp.max(y_first - splat.mean[1], -splat.half_height)
     hi = wp.min(y_last - splat.mean[1], splat.half_height)
-    y_right = wp.clamp(summit, lo, hi)
-    y_left = wp.clamp(-summit, lo, hi)
+    y_right = wp.clamp(splat.summit, lo, hi)
+    y_left = wp.clamp(-splat.summit, lo, hi)
     cr = splat.c * y_right
     cl = splat.c * y_left
     inv_a = 1.0 / splat.a
-    right = (wp.sqrt(wp.max(q - cr * cr, 0.0)) - splat.b * y_right) * inv_a
-    left = (-wp.sqrt(wp.max(q - cl * cl, 0.0)) - splat.b * y_left) * inv_a
+    right = (wp.sqrt(wp.max(splat.reach - cr * cr, 0.0)) - splat.b * y_right) * inv_a
+    left = (-wp.sqrt(wp.max(splat.reach - cl * cl, 0.0)) - splat.b * y_left) * inv_a
     right = wp.where(lo > hi, -1.0e30, right)
     left = wp.where(lo > hi, 1.0e30, left)
     return splat.mean[0] + left, splat.mean[0] + right

@@ -34,7 +34,7 @@ def harmonics_color(sh: wp.array2d[wp.vec3], i: int, degree: int, direction: wp.
 @wp.kernel
 def evaluate_harmonics(
     # In:
-    base: int,  # first entry of `order` in this launch
+    base: int,  # first rank of this launch
     order: wp.array[int],  # [V] visible Gaussians
     means: wp.array[wp.vec3],  # [N] centres [m]
     sh: wp.array2d[wp.vec3],  # [N, K] coefficients

@@ -82,13 +82,20 @@ def harmonics_backward(
     sums: wp.array2d[float],  # [N, 16] what compositing left for every Gaussian
     at_color: int,  # column of `sums` with the gradient of the first channel
     # Out:
-    sh_out: wp.array2d[wp.vec3],  # [N, K] zeroed
+    sh_out: wp.array2d[wp.vec3],  # [N, K] zero where no tile was reached and above the degree
     means_out: wp.array[wp.vec3],  # [N] added to
-    offsets_out: wp.array2d[float],  # [N, 3] gradient of centre minus camera centre, or empty
+    offsets_out: wp.array2d[float],  # [N, 3] gradient of centre minus camera centre, zero where unseen; or empty
 ):
     """Differentiate `evaluate_harmonics`; a channel that was clamped at zero has no gradient."""
     i = base + wp.tid()
+    for k in range((degree + 1) * (degree + 1), sh.shape[1]):
+        sh_out[i, k] = wp.vec3(0.0, 0.0, 0.0)
     if sums[i, SEEN] == 0.0:
+        for k in range((degree + 1) * (degree + 1)):
+            sh_out[i, k] = wp.vec3(0.0, 0.0, 0.0)
+        if offsets_out.shape[0] > 0:
+            for j in range(3):
+                offsets_out[i, j] = 0.0
         return
     away = (means[i] - camera.center) - camera.center_rest
     distance = wp.length(away)
@@ -98,10 +105,11 @@ def harmonics_backward(
     for j in range(3):
         v[j] = wp.where(color[j] > 0.0, sums[i, at_color + j], 0.0)
     spread_coefficients(degree, direction, v, i, sh_out)
+    g = wp.vec3(0.0, 0.0, 0.0)
     if degree > 0:
         g = direction_gradient(sh, i, degree, direction, v)
         g = (g - direction * wp.dot(direction, g)) / distance
         means_out[i] = means_out[i] + g
-        if offsets_out.shape[0] > 0:
-            for j in range(3):
-                offsets_out[i, j] = g[j]
+    if offsets_out.shape[0] > 0:
+        for j in range(3):
+            offsets_out[i, j] = g[j]

@@ -63,22 +63,23 @@ def localize_ids(
 @wp.kernel
 def sum_rows(
     # In:
-    base: int,  # first entry of `order` in this launch
+    base: int,  # first rank of this launch
     order: wp.array[int],  # [V] visible Gaussians
-    entries: wp.array[int],  # [V + 1] first intersection of each
-    rows: wp.array2d[Lanes],  # [I, slices]
+    entries: wp.array[int],  # [V + 1] first entry of each
+    places: wp.array[int],  # [I] place of each entry in the tile lists
+    rows: wp.array2d[Lanes],  # [I, slices] by place
     first_slice: int,  # of this pass
     slices: int,
     # Out:
     features_out: wp.array2d[Lanes],  # [N, S] added to
 ):
-    """Add the rows of each Gaussian's intersections, in order. One thread per visible Gaussian."""
+    """Add the rows of each Gaussian's entries, in order. One thread per visible Gaussian."""
     k = base + wp.tid()
     i = order[k]
     for s in range(slices):
         total = Lanes(0.0)
         for e in range(entries[k], entries[k + 1]):
-            total += rows[e, s]
+            total += rows[places[e], s]
         features_out[i, first_slice + s] += total
 
 
@@ -88,7 +89,8 @@ def sum_weights(
     base: int,
     order: wp.array[int],  # [V]
     entries: wp.array[int],  # [V + 1]
-    weights: wp.array[float],  # [I] by intersection
+    places: wp.array[int],  # [I]
+    weights: wp.array[float],  # [I] by place
     # Out:
     weight_out: wp.array[float],  # [N] added to
     weight_squared_out: wp.array[float],  # [N] added to: square of this view's total
@@ -98,7 +100,7 @@ def sum_weights(
     i = order[k]
     total = float(0.0)
     for e in range(entries[k], entries[k + 1]):
-        total += weights[e]
+        total += weights[places[e]]
     weight_out[i] += total
     weight_squared_out[i] += total * total
 
@@ -109,12 +111,13 @@ def sum_id_weights(
     base: int,
     order: wp.array[int],  # [V]
     entries: wp.array[int],  # [V + 1]
-    starts: wp.array[int],  # [I] first weight of each intersection, by Gaussian
-    tiles: wp.array[int],  # [I] its tile
+    places: wp.array[int],  # [I]
+    starts: wp.array[int],  # [I] first weight of each place
+    tiles: wp.array[int],  # [I] tile of each entry
     tile_ids: wp.array2d[int],  # [tiles, 256]
     tile_id_counts: wp.array[int],  # [tiles]
-    weights: wp.array[float],  # per fragment one weight for each id of its tile
-    by_gaussian: int,  # 1: rows of id_weights_out are Gaussians, 0: they are places in `order`
+    weights: wp.array[float],  # for each place one weight per id of its tile
+    by_gaussian: int,  # 1: rows of id_weights_out are Gaussians, 0: they are ranks
     # Out:
     id_weights_out: wp.array2d[float],  # [V or N, M] added to
     weight_out: wp.array[float],  # [N] added to
@@ -129,7 +132,7 @@ def sum_id_weights(
     run_weight = float(0.0)
     for e in range(entries[k], entries[k + 1]):
         tile = tiles[e]
-        start = starts[e]
+        start = starts[places[e]]
         for m in range(tile_id_counts[tile]):
             w = weights[start + m]
             if w > 0.0:

@@ -2,15 +2,15 @@
 
 The renderer is a matrix A with one entry alpha T per (pixel, Gaussian); lifting applies its transpose to a feature
 map. The thread that owns a tile sums each fragment's contribution over the tile's pixels in registers and writes one
-row per intersection; `lifting.py` adds up the rows of each Gaussian. No two threads write the same memory, so the
-result has the same bits for any number of threads.
+row for each place of its list; `lifting.py` adds up the rows of each Gaussian. No two threads write the same memory, so
+the result has the same bits for any number of threads.
 """
 
 from functools import cache
 
 import warp as wp
 
-from sgwarp.kernels.binning import TILE, Fragment
+from sgwarp.kernels.binning import AHEAD, TILE, fragment_of, prefetch
 from sgwarp.kernels.compositing_lanes import (
     CLOSE_EVERY,
     lane_alphas,
@@ -18,9 +18,9 @@ from sgwarp.kernels.compositing_lanes import (
     lane_contributions,
     open_lanes,
     open_row_mask,
-    row_is_reached,
     still_open,
 )
+from sgwarp.kernels.gaussian import Splat
 from sgwarp.kernels.projection import Knobs
 from sgwarp.kernels.transmittance import LANE_OPTIONS, LANES, LaneIds, Lanes
 
@@ -56,7 +56,8 @@ def make_lift_dense(slices: int) -> wp.Kernel:
         base: int,  # first tile of this launch
         slot: int,  # scratch of this launch
         offsets: wp.array[int],  # [tiles + 1]
-        fragments: wp.array[Fragment],  # [I]
+        listed: wp.array[int],  # [I]
+        splats: wp.array[Splat],  # [V]
         features: wp.array3d[Lanes],  # [H, W, S] channels in slices of 16
         valid: wp.array3d[Lanes],  # [H, tile columns, 1] 1 where the pixel carries semantics, else 0
         first_slice: int,  # of this pass
@@ -65,8 +66,8 @@ def make_lift_dense(slices: int) -> wp.Kernel:
         height: int,
         state: wp.array3d[Lanes],  # [slots, 16, 1] scratch
         # Out:
-        rows_out: wp.array2d[Lanes],  # [I, slices] sum over the tile's pixels of alpha T f, by intersection
-        weights_out: wp.array[float],  # [I] sum of alpha T over the pixels that carry semantics
+        rows_out: wp.array2d[Lanes],  # [I, slices] sum over the tile's pixels of alpha T f, by place
+        weights_out: wp.array[float],  # [I] sum of alpha T over the pixels that carry semantics, by place
     ):
         """A^T f for one tile per thread."""
         tile = base + wp.tid()
@@ -79,15 +80,17 @@ def make_lift_dense(slices: int) -> wp.Kernel:
             state[slot, row, 0] = open_lanes(x0, width)
         open_rows = open_row_mask(y0, height)
         first = offsets[tile]
-        for k in range(first, offsets[tile + 1]):
-            f = fragments[k]
+        stop = offsets[tile + 1]
+        for k in range(first, stop):
+            prefetch(splats, listed[wp.min(k + AHEAD, stop - 1)])
+            f = fragment_of(splats, listed[k], x0, y0)
             sum0 = Lanes(0.0)
             sum1 = Lanes(0.0)
             sum2 = Lanes(0.0)
             sum3 = Lanes(0.0)
             weight = Lanes(0.0)
             for row in range(f.first_row, f.last_row + 1):
-                if row_is_reached(f, row, knobs) and (open_rows >> row) & 1 != 0:
+                if (open_rows >> row) & 1 != 0:
                     T = state[slot, row, 0]
                     alphas = lane_alphas(f, row, knobs)
                     y = y0 + row
@@ -112,13 +115,13 @@ def make_lift_dense(slices: int) -> wp.Kernel:
                             sum2 += w[i] * features[y, x0 + i, first_slice + 2]
                             sum3 += w[i] * features[y, x0 + i, first_slice + 3]
             if wp.static(slices == 1):
-                rows_out[f.entry, 0] = (sum0 + sum1) + (sum2 + sum3)
+                rows_out[k, 0] = (sum0 + sum1) + (sum2 + sum3)
             else:
-                rows_out[f.entry, 0] = sum0
-                rows_out[f.entry, 1] = sum1
-                rows_out[f.entry, 2] = sum2
-                rows_out[f.entry, 3] = sum3
-            weights_out[f.entry] = lane_sum(weight)
+                rows_out[k, 0] = sum0
+                rows_out[k, 1] = sum1
+                rows_out[k, 2] = sum2
+                rows_out[k, 3] = sum3
+            weights_out[k] = lane_sum(weight)
             if (k - first) % CLOSE_EVERY == CLOSE_EVERY - 1:
                 open_rows = still_open(open_rows, state, slot)
 
@@ -131,7 +134,8 @@ def lift_ids(
     base: int,
     slot: int,
     offsets: wp.array[int],  # [tiles + 1]
-    fragments: wp.array[Fragment],  # [I]
+    listed: wp.array[int],  # [I]
+    splats: wp.array[Splat],  # [V]
     local_ids: wp.array2d[LaneIds],  # [tiles, 16] place of each pixel's id in its tile's list, -1 = none
     uniform: wp.array2d[int],  # [tiles, 16] the local id if the whole row shares it, else -2
     row_starts: wp.array[int],  # [tiles + 1] first weight of each tile
@@ -140,8 +144,8 @@ def lift_ids(
     height: int,
     state: wp.array3d[Lanes],  # [slots, 16, 1] scratch
     # Out:
-    weights_out: wp.array[float],  # zeroed; per fragment one weight for each id of its tile
-    starts_out: wp.array[int],  # [I] first weight of each intersection, by Gaussian
+    weights_out: wp.array[float],  # zeroed; for each place one weight per id of its tile
+    starts_out: wp.array[int],  # [I] first weight of each place
 ):
     """Sum of alpha T by id: the cost does not depend on the number of feature channels."""
     tile = base + wp.tid()
@@ -152,20 +156,22 @@ def lift_ids(
         state[slot, row, 0] = open_lanes(x0, width)
     open_rows = open_row_mask(y0, height)
     first = offsets[tile]
-    count = wp.max(offsets[tile + 1] - first, 1)
+    stop = offsets[tile + 1]
+    count = wp.max(stop - first, 1)
     ids = (row_starts[tile + 1] - row_starts[tile]) / count
     plain = ids == 1
     for row in range(TILE):
         if uniform[tile, row] != 0:
             plain = False
-    for k in range(first, offsets[tile + 1]):
-        f = fragments[k]
+    for k in range(first, stop):
+        prefetch(splats, listed[wp.min(k + AHEAD, stop - 1)])
+        f = fragment_of(splats, listed[k], x0, y0)
         place = row_starts[tile] + (k - first) * ids
-        starts_out[f.entry] = place
+        starts_out[k] = place
         if plain:
             total = Lanes(0.0)
             for row in range(f.first_row, f.last_row + 1):
-                if row_is_reached(f, row, knobs) and (open_rows >> row) & 1 != 0:
+                if (open_rows >> row) & 1 != 0:
                     T = state[slot, row, 0]
                     alphas = lane_alphas(f, row, knobs)
                     total += lane_contributions(alphas, T, knobs)
@@ -177,7 +183,7 @@ def lift_ids(
         run = int(-1)  # id shared by the rows summed in `total` so far
         total = Lanes(0.0)
         for row in range(f.first_row, f.last_row + 1):
-            if row_is_reached(f, row, knobs) and (open_rows >> row) & 1 != 0:
+            if (open_rows >> row) & 1 != 0:
                 T = state[slot, row, 0]
                 alphas = lane_alphas(f, row, knobs)
                 w = lane_contributions(alphas, T, knobs)

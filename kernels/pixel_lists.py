@@ -21,9 +21,9 @@ def make_list_contributors(write: bool) -> wp.Kernel:
     def list_contributors(
         # In:
         base: int,  # first pixel of this launch
-        first_listed: int,  # of a tile's list, the first entry to look at
+        first_listed: int,  # of a tile's list, the first place to look at
         last_listed: int,  # and the first not to look at
-        transmittances: wp.array[float],  # [images * H * W] before that entry
+        transmittances: wp.array[float],  # [images * H * W] before that place
         means: wp.array[wp.vec2],  # [M] [pixels]
         conics: wp.array[wp.vec3],  # [M] (A, B, C) [1 / pixels^2]
         opacities: wp.array[float],  # [M]
@@ -33,8 +33,8 @@ def make_list_contributors(write: bool) -> wp.Kernel:
         tile_size: int,  # [pixels]
         tile_columns: int,
         tile_rows: int,
-        offsets: wp.array[int],  # [images * tiles + 1] first entry of each tile
-        listed: wp.array[int],  # [I] splat of each entry, front to back
+        offsets: wp.array[int],  # [images * tiles + 1] first place of each tile
+        listed: wp.array[int],  # [I] splats, tile by tile, front to back
         places: wp.array[wp.int64],  # [images * H * W] where the pixel's pairs go
         # Out:
         counts_out: wp.array[int],  # [images * H * W]; not written with `write`

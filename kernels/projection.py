@@ -7,10 +7,13 @@ from sgwarp.kernels.gaussian import (
     LEVEL_SLACK,
     LOG2_E,
     MIN_QUAT_NORM2,
+    UNIT,
     Pinhole,
     Splat,
     camera_from_world,
+    ewa_rows,
     factor_determinant,
+    footprint_factor,
     projected_factor,
 )
 
@@ -49,6 +52,24 @@ def is_finite(mean: wp.vec3, quat: wp.vec4, scale: wp.vec3, opacity: float) -> b
     return wp.isfinite(total) and norm2 >= MIN_QUAT_NORM2
 
 
+@wp.func
+def is_far_off_screen(camera: Pinhole, point: wp.vec3, scale: wp.vec3, knobs: Knobs) -> bool:
+    """Whether not even a round, opaque Gaussian of the largest scale would reach the image: no square root is needed.
+
+    Its deviation along an image axis is at most scale |J row|, its footprint sqrt(2 ln(1 / alpha_min)) times that.
+    """
+    row_x, row_y = ewa_rows(camera, point)
+    largest = wp.max(scale)
+    reach2 = (LEVEL_SLACK - knobs.alpha_min_level) * 2.0 / LOG2_E
+    width2 = reach2 * (largest * largest * wp.length_sq(row_x) + knobs.dilation)
+    height2 = reach2 * (largest * largest * wp.length_sq(row_y) + knobs.dilation)
+    x = camera.focal[0] * point[0] / point[2] + camera.principal[0]
+    y = camera.focal[1] * point[1] / point[2] + camera.principal[1]
+    away_x = wp.max(wp.max(-x, x - float(camera.width)), 0.0)
+    away_y = wp.max(wp.max(-y, y - float(camera.height)), 0.0)
+    return away_x * away_x > width2 or away_y * away_y > height2
+
+
 @wp.kernel
 def project_gaussians(
     # In:
@@ -81,6 +102,10 @@ def project_gaussians(
         status_out[i] = wp.uint8(OUTSIDE_DEPTH)
         return
 
+    if is_far_off_screen(camera, point, scale, knobs):
+        status_out[i] = wp.uint8(OFF_SCREEN)
+        return
+
     m_x, m_y = projected_factor(camera, point, quat, scale)
     xx = wp.length_sq(m_x)
     yy = wp.length_sq(m_y)
@@ -99,22 +124,23 @@ def project_gaussians(
             return
 
     splat = Splat()
+    inv_z = 1.0 / point[2]
     splat.mean = wp.vec2(
-        camera.focal[0] * point[0] / point[2] + camera.principal[0],
-        camera.focal[1] * point[1] / point[2] + camera.principal[1],
+        camera.focal[0] * (point[0] * inv_z) + camera.principal[0],
+        camera.focal[1] * (point[1] * inv_z) + camera.principal[1],
     )
-    # Cholesky rows of the conic, scaled so that the exponent is a power of two.
-    unit = wp.sqrt(0.5 * LOG2_E)
-    root = wp.sqrt(determinant)
-    splat.a = unit * wp.sqrt(yy) / root
-    splat.b = -unit * xy / (wp.sqrt(yy) * root)
-    splat.c = unit / wp.sqrt(yy)
+    a, b, c = footprint_factor(xy, yy, determinant)
+    splat.a = a
+    splat.b = b
+    splat.c = c
     splat.level = wp.log2(opacity)
     splat.depth = point[2]
-    q = splat.level - knobs.alpha_min_level + LEVEL_SLACK
-    reach = wp.sqrt(q) / unit
-    splat.half_width = reach * wp.sqrt(xx)
-    splat.half_height = reach * wp.sqrt(yy)
+    splat.reach = splat.level - knobs.alpha_min_level + LEVEL_SLACK
+    radius = wp.sqrt(splat.reach) * (1.0 / UNIT)
+    splat.half_width = radius * wp.sqrt(xx)
+    splat.half_height = radius * wp.sqrt(yy)
+    splat.inv_bc = wp.sqrt(determinant / xx) * (1.0 / UNIT)
+    splat.summit = -b * splat.half_height * splat.inv_bc
     x = splat.mean[0]
     y = splat.mean[1]
     inside = x + splat.half_width >= 0.5 and x - splat.half_width <= float(camera.width) - 0.5

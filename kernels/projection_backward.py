@@ -15,6 +15,7 @@ from sgwarp.kernels.gaussian import (
     Pinhole,
     camera_from_world,
     ewa_rows,
+    footprint_factor,
     rotation_from_quaternion,
 )
 from sgwarp.kernels.projection import Knobs
@@ -24,29 +25,40 @@ wp.set_module_options(EXACT_OPTIONS)
 
 LN_2 = wp.constant(0.6931471805599453)
 SEEN = wp.constant(15)  # column of the sums that is positive where a Gaussian reached a tile
+ROWS_AHEAD = wp.constant(16)  # rows between the one that is added and the one that is fetched
 POSE_COLUMNS = 12  # gradient of the world-to-camera rotation about the camera's centre, row by row, and translation
 mat23 = wp.types.matrix(shape=(2, 3), dtype=wp.float32)
+
+
+@wp.func_native("""
+#if !defined(__CUDA_ARCH__)
+    if (entry < places.shape[0]) __builtin_prefetch(rows.data + places.data[entry]);
+#endif
+""")
+def prefetch_row(rows: wp.array[Lanes], places: wp.array[int], entry: int): ...  # a hint for the CPU's cache
 
 
 @wp.kernel
 def sum_intersections(
     # In:
-    base: int,  # first entry of `order` in this launch
+    base: int,  # first rank of this launch
     order: wp.array[int],  # [V] Gaussians
-    entries: wp.array[int],  # [V + 1] first intersection of each
-    rows: wp.array[Lanes],  # [I] by intersection
+    entries: wp.array[int],  # [V + 1] first entry of each
+    places: wp.array[int],  # [I] place of each entry in the tile lists
+    rows: wp.array[Lanes],  # [I] by place
     # Out:
     sums_out: wp.array[Lanes],  # [N] zeroed
 ):
-    """Add the rows of each Gaussian's intersections, in order, and mark the Gaussian as seen."""
+    """Add the rows of each Gaussian's entries, in order, and mark the Gaussian as seen."""
     k = base + wp.tid()
     first = entries[k]
     last = entries[k + 1]
     if first == last:
         return
-    total = rows[first]
-    for e in range(first + 1, last):
-        total += rows[e]
+    total = Lanes(0.0)
+    for e in range(first, last):
+        prefetch_row(rows, places, e + ROWS_AHEAD)
+        total += rows[places[e]]
     total[SEEN] = 1.0
     sums_out[order[k]] = total
 
@@ -109,7 +121,7 @@ def project_backward(
     sums: wp.array2d[float],  # [N, 16] moments of g under 1, u, v, u^2, u v, v^2, then others; last: seen or not
     at_depth: int,  # column of `sums` with the gradient of the depth, -1 = none
     # Out:
-    means_out: wp.array[wp.vec3],  # [N] zeroed, as all that follow
+    means_out: wp.array[wp.vec3],  # [N] zero where no tile was reached, as all that follow
     quats_out: wp.array[wp.vec4],  # [N]
     scales_out: wp.array[wp.vec3],  # [N]
     opacities_out: wp.array[float],  # [N]
@@ -119,6 +131,14 @@ def project_backward(
     """Differentiate `project_gaussians`."""
     i = base + wp.tid()
     if sums[i, SEEN] == 0.0:
+        means_out[i] = wp.vec3(0.0, 0.0, 0.0)
+        quats_out[i] = wp.vec4(0.0, 0.0, 0.0, 0.0)
+        scales_out[i] = wp.vec3(0.0, 0.0, 0.0)
+        opacities_out[i] = 0.0
+        means2d_out[i] = wp.vec2(0.0, 0.0)
+        if poses_out.shape[0] > 0:
+            for r in range(POSE_COLUMNS):
+                poses_out[i, r] = 0.0
         return
     quat = quats[i]
     scale = scales[i]
@@ -137,11 +157,7 @@ def project_backward(
     yy = wp.length_sq(m_y)
     determinant = sharp + knobs.dilation * (xx + yy) + knobs.dilation * knobs.dilation
     yy += knobs.dilation
-    unit = wp.sqrt(0.5 * LOG2_E)
-    root = wp.sqrt(determinant)
-    a = unit * wp.sqrt(yy) / root
-    b = -unit * wp.dot(m_x, m_y) / (wp.sqrt(yy) * root)
-    c = unit / wp.sqrt(yy)
+    a, b, c = footprint_factor(wp.dot(m_x, m_y), yy, determinant)
 
     g = LN_2 * sums[i, 0]
     gu = LN_2 * sums[i, 1]

@@ -288,10 +288,10 @@ plt.show()
 # %% [markdown]
 # ## Bin
 #
-# Compositing works on tiles of 16 x 16 pixels. `count_tiles` walks the splats in depth order and counts, `fill_tiles`
-# walks them again and writes each into the lists of its tiles: the lists come out front to back and are never sorted.
-# Both run in slices of the depth order that can be worked on at the same time; one slice is enough here. What lands in
-# a list is a `Fragment`, a copy of the splat relative to its tile, so that compositing reads memory front to back.
+# Tiles are 16 x 16 pixels. `count_tiles` brings the splats into depth order and counts, `fill_tiles` writes their
+# *ranks*, places in that order, into the lists of their tiles, front to back: no list is ever sorted. Both work on
+# slices of the order; one is enough here. Copies of the splats in the lists would cost more to write than reading
+# front to back saves: a splat is one line of the cache, asked for six places ahead (`prefetch`).
 
 
 # %%
@@ -305,22 +305,22 @@ def bin_splats(camera, splats, status, depths):
     count = len(order)
     colors, ordered = wp.zeros(count, dtype=wp.vec3), wp.zeros(count, dtype=Splat)
     wp.launch(harmonics.evaluate_harmonics, count, [0, order, means, coefficients, 1, camera], [colors])
-    wp.launch(binning.gather_splats, count, [0, order, splats], [ordered])
     tile_counts, splat_counts = wp.zeros((1, TILES), dtype=int), wp.zeros(count, dtype=int)
-    sizes = [count, WIDTH, HEIGHT, knobs.alpha_min_level]
-    wp.launch(binning.count_tiles, 1, [0, ordered, *sizes], [tile_counts, splat_counts])
+    sizes = [count, WIDTH, HEIGHT]
+    wp.launch(binning.count_tiles, 1, [0, order, splats, colors, *sizes], [ordered, tile_counts, splat_counts])
     offsets, entries = starts(tile_counts.numpy()[0]), starts(splat_counts.numpy())
+    listed, places, tiles = (wp.zeros(int(offsets[-1]), dtype=int) for _ in range(3))
     lists = {
         "order": order,  # [V] Gaussians front to back
-        "entries": wp.array(entries),  # [V + 1] first intersection of each
-        "offsets": wp.array(offsets),  # [tiles + 1] first fragment of each tile
-        "fragments": wp.zeros(int(offsets[-1]), dtype=binning.Fragment),  # [I] the lists
-        "places": wp.zeros(int(offsets[-1]), dtype=int),  # [I] where each intersection stands in the lists
-        "tiles": wp.zeros(int(offsets[-1]), dtype=int),  # [I] and in which tile
+        "splats": ordered,  # [V] likewise
+        "offsets": wp.array(offsets),  # [tiles + 1] first place of each tile
+        "listed": listed,  # [I] the lists: ranks, tile by tile
+        "entries": wp.array(entries),  # [V + 1] first entry of each, one per tile
+        "places": places,  # [I] place of each entry
+        "tiles": tiles,  # [I] tile of each entry
     }
     cursors = wp.array(offsets[None, :-1].copy())
-    inputs = [0, order, ordered, colors, *sizes, lists["entries"], cursors]
-    wp.launch(binning.fill_tiles, 1, inputs, [lists["fragments"], lists["places"], lists["tiles"]])
+    wp.launch(binning.fill_tiles, 1, [0, ordered, *sizes, lists["entries"], cursors], [listed, places, tiles])
     return lists
 
 
@@ -342,8 +342,8 @@ touched = lists["tiles"].numpy()[slice(*lists["entries"].numpy()[one : one + 2])
 
 fig, (left, right) = plt.subplots(1, 2, figsize=(11, 3.9), width_ratios=(1.6, 1))
 crowd = left.imshow(per_tile, cmap="magma", extent=(0, WIDTH, HEIGHT, 0))
-fig.colorbar(crowd, ax=left, label="fragments", shrink=0.9)
-left.set_title(f"{per_tile.sum()} fragments in {TILES} tiles, at most {per_tile.max()} in one")
+fig.colorbar(crowd, ax=left, label="splats", shrink=0.9)
+left.set_title(f"{len(order)} splats, {per_tile.sum()} ranks in {TILES} lists, at most {per_tile.max()} in one")
 for row in range(first[one, 1], last[one, 1] + 1):
     for column in range(first[one, 0], last[one, 0] + 1):
         reached = row * COLUMNS + column in touched
@@ -361,10 +361,10 @@ plt.show()
 # %% [markdown]
 # ## Composite
 #
-# One thread walks a tile's list from front to back and adds $c_i\,\alpha_i\,T_i$ to every pixel, where
+# One thread walks a tile's list front to back and adds $c_i\,\alpha_i\,T_i$ to every pixel, where
 # $T_i = \prod_{j<i} (1 - \alpha_j)$ is the light that the Gaussians in front let through (eq. 1). This is the *lane*
-# schedule, made for CPUs: 16 pixels of a row are one vector. `make_composite_colors(True)` builds the variant that
-# also keeps both depths; `state` is its scratch, one slot for each host thread.
+# schedule, made for CPUs: 16 pixels of a row are one vector. `make_composite_colors(True, False)` keeps both depths,
+# but not what training needs (`None`); `state` is scratch, one slot for each host thread.
 
 
 # %%
@@ -372,8 +372,8 @@ def composite(lists):
     """Colours, transmittance, sum of alpha T z and the depth of the surface."""
     outputs = [wp.zeros((HEIGHT, WIDTH), dtype=kind) for kind in (wp.vec3, float, float, float)]
     state = wp.zeros((1, 16, 6), dtype=Lanes)
-    inputs = [0, 0, lists["offsets"], lists["fragments"], knobs, WIDTH, HEIGHT, state]
-    wp.launch(compositing_lanes.make_composite_colors(True), TILES, inputs, outputs)
+    inputs = [0, 0, lists["offsets"], lists["listed"], lists["splats"], knobs, WIDTH, HEIGHT, state]
+    wp.launch(compositing_lanes.make_composite_colors(True, False), TILES, inputs, [*outputs, None, None])
     return [output.numpy() for output in outputs]
 
 
@@ -404,7 +404,7 @@ print(f"largest difference to sg.render: {difference_to_render:.1e}")
 # %% [markdown]
 # ### One ray
 #
-# What happens at one pixel, in plain NumPy from the fragments of its tile. Every Gaussian takes its share
+# What happens at one pixel, in plain NumPy from the list of its tile. Every Gaussian takes its share
 # $\alpha_i T_i$ of the light that the ones in front let through: a step of the line, drawn in its own colour. The
 # paper's depth is $z$ of the Gaussian at which accumulated opacity passes $\alpha_d$ = 0.5: here the ring, although a
 # good part of the light comes from the floor behind it.
@@ -412,10 +412,10 @@ print(f"largest difference to sg.render: {difference_to_render:.1e}")
 # %%
 column, row = 369, 193  # on the inner edge of the ring
 tile = (row // 16) * COLUMNS + column // 16
-ray = lists["fragments"].numpy()[slice(*lists["offsets"].numpy()[tile : tile + 2])]
-in_tile = len(ray)
-u = ray["a"] * (column % 16 - ray["x"]) + ray["b"] * (row % 16 - ray["y"])
-v = ray["c"] * (row % 16 - ray["y"])
+ranks = lists["listed"].numpy()[slice(*lists["offsets"].numpy()[tile : tile + 2])]
+ray = lists["splats"].numpy()[ranks]
+dx, dy = (np.float32([column + 0.5, row + 0.5]) - ray["mean"]).T
+u, v = ray["a"] * dx + ray["b"] * dy, ray["c"] * dy
 alpha = np.minimum(np.exp2(ray["level"] - u**2 - v**2), knobs.alpha_max)
 ray, alpha = ray[alpha >= knobs.alpha_min], alpha[alpha >= knobs.alpha_min]
 T = np.concatenate([[1], np.cumprod(1 - alpha)])
@@ -431,7 +431,7 @@ axes[1].vlines(ray["depth"], T[1:], T[:-1], color=ray["color"].clip(0, 1), linew
 axes[1].axvline(surface[row, column], color="#d62728", linestyle="--", label=r"depth: $T \leq 1 - \alpha_d$")
 axes[1].axvline(share @ ray["depth"] / share.sum(), color="#1f77b4", linestyle=":", label="expected depth")
 axes[1].set(xlabel="depth z [m]", ylabel="light let through, T", ylim=(0, 1.02))
-axes[1].set_title(f"{len(ray)} of {in_tile} fragments reach it; difference to the kernel {ray_error:.0e}")
+axes[1].set_title(f"{len(ray)} of {len(ranks)} splats reach it; difference to the kernel {ray_error:.0e}")
 axes[1].legend()
 plt.show()
 
@@ -455,24 +455,23 @@ plt.show()
 # %% [markdown]
 # ### The other schedule
 #
-# On CUDA a *block* of 256 threads owns a tile, one thread for each pixel, and stages the fragments through shared
-# memory. The device functions are the same, and so is the picture. Without a GPU, Warp can run a block as cooperative
-# fibers on the CPU: slow, but enough for a crop. Fragments are relative to their tile, so a crop is nothing but a
-# choice of tile lists.
+# On CUDA a *block* of 256 threads owns a tile, one thread for each pixel, and stages the splats through shared memory.
+# The maths is the same, and so is the picture. Without a GPU, Warp can run a block as cooperative fibers on the CPU:
+# slow, but enough for a crop, which is nothing but a choice of tile lists, and splats moved by its corner.
 
 # %%
 crop = (slice(112, 192), slice(240, 400))
 kept_tiles = np.arange(TILES).reshape(ROWS, COLUMNS)[7:12, 15:25].ravel()
-offsets, fragments = lists["offsets"].numpy(), lists["fragments"].numpy()
-kept = [fragments[offsets[t] : offsets[t + 1]] for t in kept_tiles]
-kept_offsets = wp.array(starts([len(piece) for piece in kept]))
-kept_fragments = wp.array(np.concatenate(kept), dtype=binning.Fragment)
+kept = [lists["listed"].numpy()[slice(*lists["offsets"].numpy()[t : t + 2])] for t in kept_tiles]
+kept_offsets, kept_lists = wp.array(starts([len(piece) for piece in kept])), wp.array(np.concatenate(kept))
+moved = lists["splats"].numpy().copy()
+moved["mean"] -= (240, 112)
 
 block = [wp.zeros((80, 160), dtype=kind) for kind in (wp.vec3, float, float, float)]
-kernel = compositing_block.make_composite_colors_block(True)
+kernel = compositing_block.make_composite_colors_block(True, False)
 wp.config.enable_cpu_blocks = True
-inputs = [kept_offsets, kept_fragments, knobs, 160, 80]
-wp.launch_tiled(kernel, dim=[len(kept)], inputs=inputs, outputs=block, block_dim=256)
+inputs = [kept_offsets, kept_lists, wp.array(moved, dtype=Splat), knobs, 160, 80]
+wp.launch_tiled(kernel, dim=[len(kept)], inputs=inputs, outputs=[*block, None, None], block_dim=256)
 wp.config.enable_cpu_blocks = False
 
 lanes = (image, transmittance, depth_sum, surface)
@@ -513,8 +512,8 @@ def composite_features(lists, features):
     batch = (1, 16, compositing_lanes.BATCH)
     scratch = [wp.zeros((1, 16, 17), dtype=Lanes), wp.zeros(batch, dtype=Lanes), wp.zeros(batch, dtype=int)]
     slices = in_lanes(features).reshape((N, 1, 1))
-    inputs = [0, 0, lists["offsets"], lists["fragments"], slices, 0, knobs, WIDTH, HEIGHT, *scratch]
-    wp.launch(compositing_lanes.make_composite_features(1), TILES, inputs, [blended, transmittance])
+    inputs = [0, 0, lists["offsets"], lists["listed"], lists["splats"], slices, 0, knobs, WIDTH, HEIGHT, *scratch]
+    wp.launch(compositing_lanes.make_composite_features(1, False), TILES, inputs, [blended, transmittance, None])
     return blended.numpy()
 
 
@@ -531,9 +530,9 @@ first_labels = largest(composite_features(lists, one_hot))
 # channels, because only weights are summed:
 #
 # 1. `localize_ids` lists the distinct ids of each tile;
-# 2. `lift_ids` walks each tile once and writes one weight for every (fragment, id);
-# 3. `sum_id_weights` adds them up, one thread per Gaussian over its own intersections. No two threads write to the same
-#    place, so no atomic additions are needed, and the sums have the same bits every time.
+# 2. `lift_ids` walks each tile once and writes one weight for every (place, id);
+# 3. `sum_id_weights` adds them up, one thread per Gaussian, found through `places`. Threads write disjoint memory,
+#    so no atomic additions are needed, and the sums have the same bits every time.
 
 
 # %%
@@ -546,11 +545,11 @@ def lift_ids(lists, id_map, classes):
     row_starts = starts(np.diff(lists["offsets"].numpy()) * counts.numpy())
     weights, first_weights = wp.zeros(int(row_starts[-1]), dtype=float), wp.zeros(len(lists["tiles"]), dtype=int)
     state = wp.zeros((1, 16, 1), dtype=Lanes)
-    inputs = [0, 0, lists["offsets"], lists["fragments"], local_ids, uniform, wp.array(row_starts), knobs]
-    wp.launch(lifting_lanes.lift_ids, TILES, [*inputs, WIDTH, HEIGHT, state], [weights, first_weights])
+    inputs = [0, 0, lists["offsets"], lists["listed"], lists["splats"], local_ids, uniform, wp.array(row_starts)]
+    wp.launch(lifting_lanes.lift_ids, TILES, [*inputs, knobs, WIDTH, HEIGHT, state], [weights, first_weights])
     sums = [wp.zeros((N, classes), dtype=float), wp.zeros(N, dtype=float), wp.zeros(N, dtype=float)]
-    inputs = [0, lists["order"], lists["entries"], first_weights, lists["tiles"], tile_ids, counts, weights, 1]
-    wp.launch(lifting.sum_id_weights, len(lists["order"]), inputs, sums)
+    inputs = [0, lists["order"], lists["entries"], lists["places"], first_weights, lists["tiles"]]
+    wp.launch(lifting.sum_id_weights, len(lists["order"]), [*inputs, tile_ids, counts, weights, 1], sums)
     return sums[0].numpy()
 
 
@@ -614,11 +613,12 @@ def lift_dense(lists, features, valid):
     mask = wp.array(valid.astype(np.float32).reshape(HEIGHT, COLUMNS, 1, 16), dtype=Lanes)  # WIDTH is 16 COLUMNS
     rows, weights = wp.zeros((total, 1), dtype=Lanes), wp.zeros(total, dtype=float)
     state = wp.zeros((1, 16, 1), dtype=Lanes)
-    inputs = [0, 0, lists["offsets"], lists["fragments"], in_lanes(features), mask, 0, knobs, WIDTH, HEIGHT, state]
-    wp.launch(lifting_lanes.make_lift_dense(1), TILES, inputs, [rows, weights])
+    inputs = [0, 0, lists["offsets"], lists["listed"], lists["splats"], in_lanes(features), mask, 0, knobs]
+    wp.launch(lifting_lanes.make_lift_dense(1), TILES, [*inputs, WIDTH, HEIGHT, state], [rows, weights])
     sums, weight, squared = wp.zeros((N, 1), dtype=Lanes), wp.zeros(N, dtype=float), wp.zeros(N, dtype=float)
-    wp.launch(lifting.sum_rows, visible, [0, lists["order"], lists["entries"], rows, 0, 1], [sums])
-    wp.launch(lifting.sum_weights, visible, [0, lists["order"], lists["entries"], weights], [weight, squared])
+    own = [0, lists["order"], lists["entries"], lists["places"]]
+    wp.launch(lifting.sum_rows, visible, [*own, rows, 0, 1], [sums])
+    wp.launch(lifting.sum_weights, visible, [*own, weights], [weight, squared])
     return sums.numpy()[:, 0], weight.numpy()
 
 
@@ -715,8 +715,8 @@ print(f"largest difference to ops.lift: {difference_to_lift:.1e} of the largest 
 # %% [markdown]
 # ## On your own
 #
-# - Set `knobs.alpha_min` to 0.05 and look at the number of fragments and at the difference to the image above.
-# - Paint the first 10, 20, 50 fragments of every tile: shorten the lists as the crop did.
+# - Set `knobs.alpha_min` to 0.05 and look at the length of the lists and at the difference to the image above.
+# - Paint the first 10, 20, 50 splats of every tile: shorten the lists as the crop did.
 # - Move `knobs.surface_transmittance`: how does the paper's depth change at edges and on the thin rim of the floor?
 # - Lift the colours of the first view as features and render them from the second: what happens to the sheen?
 # - Replace `noisy_features` by the maps of a real model, and this scene by `sg.load_gaussians("scene.ply")`.

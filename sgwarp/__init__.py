@@ -18,7 +18,11 @@ if TYPE_CHECKING:
     from sgwarp.encoders.registry import make_encoder as make_encoder
     from sgwarp.encoders.registry import text_encoder_for as text_encoder_for
     from sgwarp.errors import InputError as InputError
+    from sgwarp.fit import fit as fit
+    from sgwarp.fitting.settings import FitSettings as FitSettings
     from sgwarp.from_depth import gaussians_from_depth as gaussians_from_depth
+    from sgwarp.io.openscene import load_openscene as load_openscene
+    from sgwarp.io.points import load_points as load_points
     from sgwarp.io.scenes import load_gaussians as load_gaussians
     from sgwarp.io.scenes import save_gaussians as save_gaussians
     from sgwarp.io.store import load_semantics as load_semantics
@@ -28,6 +32,9 @@ if TYPE_CHECKING:
     from sgwarp.network import SemanticNetwork as SemanticNetwork
     from sgwarp.network import load_network as load_network
     from sgwarp.network import save_network as save_network
+    from sgwarp.ops.contributors import top_contributors as top_contributors
+    from sgwarp.ops.differentiable import rasterize as rasterize
+    from sgwarp.ops.plan import RenderPlan as RenderPlan
     from sgwarp.ops.settings import RasterSettings as RasterSettings
     from sgwarp.orbit import orbit_views as orbit_views
     from sgwarp.predict import predict as predict
@@ -36,6 +43,7 @@ if TYPE_CHECKING:
     from sgwarp.query import relevancy as relevancy
     from sgwarp.query import select as select
     from sgwarp.query import standardise as standardise
+    from sgwarp.render import plan as plan
     from sgwarp.render import render as render
     from sgwarp.runlog import RunLog as RunLog
     from sgwarp.scene import Camera as Camera
@@ -50,9 +58,11 @@ _HOME = {
     "Camera": "sgwarp.scene",
     "DistillSettings": "sgwarp.distill.settings",
     "FeatureMap": "sgwarp.scene",
+    "FitSettings": "sgwarp.fitting.settings",
     "Gaussians": "sgwarp.scene",
     "InputError": "sgwarp.errors",
     "RasterSettings": "sgwarp.ops.settings",
+    "RenderPlan": "sgwarp.ops.plan",
     "RunLog": "sgwarp.runlog",
     "SemanticNetwork": "sgwarp.network",
     "Semantics": "sgwarp.scene",
@@ -60,17 +70,22 @@ _HOME = {
     "View": "sgwarp.scene",
     "distill": "sgwarp.distill.train",
     "evidence": "sgwarp.query",
+    "fit": "sgwarp.fit",
     "gaussians_from_depth": "sgwarp.from_depth",
     "lift": "sgwarp.lift",
     "load_gaussians": "sgwarp.io.scenes",
     "load_network": "sgwarp.network",
+    "load_openscene": "sgwarp.io.openscene",
+    "load_points": "sgwarp.io.points",
     "load_semantics": "sgwarp.io.store",
     "load_views": "sgwarp.io.views",
     "localize": "sgwarp.segment",
     "make_encoder": "sgwarp.encoders.registry",
     "orbit_views": "sgwarp.orbit",
     "predict": "sgwarp.predict",
+    "plan": "sgwarp.render",
     "query": "sgwarp.query",
+    "rasterize": "sgwarp.ops.differentiable",
     "relevancy": "sgwarp.query",
     "render": "sgwarp.render",
     "save_gaussians": "sgwarp.io.scenes",
@@ -81,6 +96,7 @@ _HOME = {
     "select": "sgwarp.query",
     "standardise": "sgwarp.query",
     "text_encoder_for": "sgwarp.encoders.registry",
+    "top_contributors": "sgwarp.ops.contributors",
 }
 __all__ = [*_HOME, "__version__"]
 

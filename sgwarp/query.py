@@ -9,11 +9,11 @@ import torch
 from torch import Tensor
 
 from sgwarp.encoders.base import TextEncoder
+from sgwarp.encoders.prompts import CANONICAL
 from sgwarp.ensemble import Ensemble, combine, require_together, seen_by
 from sgwarp.errors import InputError
 from sgwarp.scene import Semantics
 
-CANONICAL = ("object", "things", "stuff", "texture")
 CHUNK = 65536  # Gaussians scored at once: half precision features are widened chunk by chunk
 
 

@@ -7,6 +7,7 @@ from typing import Literal, get_args
 from torch import Tensor
 
 from sgwarp.errors import InputError
+from sgwarp.ops.plan import RenderPlan, Values, plan_render
 from sgwarp.ops.rasterize import rasterize
 from sgwarp.ops.settings import RasterSettings
 from sgwarp.runlog import RunLog
@@ -35,7 +36,8 @@ def render(
         features: One row per Gaussian, float32 [N, C]; only for mode "features".
         background: What shows where the scene is transparent, one value per channel, [C]; zero if None.
         settings: Thresholds of the rasterizer.
-        log: Counts the Gaussians that were left out, by reason, as `culled_...`.
+        log: Counts the Gaussians that were left out, by reason, as `culled_...`, and what the plan left out, as
+            `..._not_needed`.
 
     Raises:
         InputError: Unknown mode, or features missing where they are needed or given where they are not.
@@ -47,23 +49,43 @@ def render(
     if (mode == "features") != (features is not None):
         raise InputError(f"mode '{mode}': features [N, C] belong to mode 'features', and only to it")
     settings = settings or RasterSettings()
-    if mode in ("rgb", "features"):
-        rendering = rasterize(gaussians, camera, features, background=background, settings=settings)
-        image = rendering.features
-    else:
-        # No colour is asked for: one empty channel keeps spherical harmonics out of the work.
-        nothing = gaussians.means.new_zeros(len(gaussians), 1)
-        rendering = rasterize(
-            gaussians,
-            camera,
-            nothing,
-            expected_depth=mode == "expected_depth",
-            depth=mode == "depth",
-            settings=settings,
-        )
-        image = getattr(rendering, mode)
+    chosen = plan(gaussians, mode, features=features, settings=settings)
+    rendering = rasterize(
+        gaussians,
+        camera,
+        features,
+        background=background if chosen.values != "nothing" else None,
+        expected_depth=mode == "expected_depth",
+        depth=mode == "depth",
+        settings=settings,
+        plan=chosen,
+    )
     if log is not None:
         for reason, count in rendering.culled.items():
             log.leave_out(f"culled_{reason}", count)
+        for what, amount in chosen.left_out:
+            log.leave_out(f"{what}_not_needed", amount)
+    image = rendering.features if chosen.values != "nothing" else getattr(rendering, mode)
     assert isinstance(image, Tensor)
     return image
+
+
+def plan(
+    gaussians: Gaussians,
+    mode: RenderMode = "rgb",
+    features: Tensor | None = None,
+    settings: RasterSettings | None = None,
+) -> RenderPlan:
+    """What `render` would compute and what it would leave out, as `print` shows it.
+
+    Args:
+        gaussians, mode, features, settings: As for `render`.
+    """
+    values: Values = "colors" if mode == "rgb" else "features" if mode == "features" else "nothing"
+    return plan_render(
+        gaussians,
+        values,
+        channels=3 if features is None else features.shape[1],
+        depth=mode in ("depth", "expected_depth"),
+        settings=settings or RasterSettings(),
+    )

@@ -46,7 +46,8 @@ def residual(
     step = math.ceil(math.sqrt(height * width / PIXELS))
     grid = (slice(None), slice(step // 2, None, step), slice(step // 2, None, step))
     divisor = torch.where(weight > 0, weight, 1.0)[:, None]
-    target = _LabelTarget if feature_map.labels is not None else _FeatureTarget
+    one_hot = feature_map.labels is not None and feature_map.ids is not None  # dense shares of labels are features
+    target = _LabelTarget if one_hot else _FeatureTarget
     compared = target(feature_map, grid, features.device)
     together = max(16, IMAGE_BYTES // (4 * height * width) // 16 * 16)
     for start in range(0, feature_map.channels, together):

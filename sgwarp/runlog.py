@@ -27,6 +27,7 @@ class RunLog:
         left_out: What was skipped because the scene or the request did not need it: how many, or seconds saved.
         error: The run's own error figures.
         outputs: Files written.
+        curve: How a run that improves step by step got there, one row of numbers per measurement; else left out.
     """
 
     command: str = ""
@@ -37,6 +38,7 @@ class RunLog:
     left_out: dict[str, float] = field(default_factory=dict)
     error: dict[str, float] = field(default_factory=dict)
     outputs: list[str] = field(default_factory=list)
+    curve: list[dict[str, float]] = field(default_factory=list)
 
     @contextmanager
     def stage(self, name: str) -> Iterator[None]:
@@ -60,7 +62,10 @@ class RunLog:
         """Write `run.json` into `folder`, whole or not at all; numbers that are not finite become null."""
         record = asdict(self)
         record["stages"] = {name: round(seconds, 4) for name, seconds in self.stages.items()}
-        record["error"] = {name: value if math.isfinite(value) else None for name, value in self.error.items()}
+        record["error"] = _finite(self.error)
+        record["curve"] = [_finite(row) for row in self.curve]
+        if not self.curve:
+            del record["curve"]
         path = folder / "run.json"
         with atomic_path(path) as temporary:
             temporary.write_text(json.dumps(record, indent=2, allow_nan=False) + "\n", encoding="utf-8")
@@ -72,3 +77,7 @@ class RunLog:
         errors = ", ".join(f"{name} {value:.4f}" for name, value in self.error.items())
         left = ", ".join(f"{amount:g} {what.replace('_', ' ')}" for what, amount in self.left_out.items())
         return "; ".join(part for part in (times, errors, f"left out: {left}" if left else "") if part)
+
+
+def _finite(numbers: dict[str, float]) -> dict[str, float | None]:
+    return {name: value if math.isfinite(value) else None for name, value in numbers.items()}

@@ -87,6 +87,13 @@ class Gaussians:
         outside = (self.opacities < 0) | (self.opacities > 1)
         _first_bad("opacities", outside, "expected a value in [0, 1]; apply the sigmoid to logits", self.opacities)
 
+    @classmethod
+    def unchecked(cls, means: Tensor, quats: Tensor, scales: Tensor, opacities: Tensor, sh: Tensor) -> Gaussians:
+        """Gaussians of tensors that are known to be float32, contiguous and of the right shapes; nothing is read."""
+        gaussians = object.__new__(cls)
+        gaussians.__dict__.update(means=means, quats=quats, scales=scales, opacities=opacities, sh=sh)
+        return gaussians
+
     def __len__(self) -> int:
         return len(self.means)
 
@@ -97,6 +104,16 @@ class Gaussians:
     @property
     def sh_degree(self) -> int:
         return math.isqrt(self.sh.shape[1]) - 1
+
+    @cached_property
+    def used_sh_degree(self) -> int:
+        """Highest degree with a coefficient that is not zero."""
+        for degree in range(self.sh_degree, 0, -1):
+            part = self.sh.detach()[:, degree * degree : (degree + 1) ** 2]
+            # A few rows mostly decide it; all are read only where these are zero.
+            if bool((part[:: max(1, len(part) // 256)] != 0).any()) or bool((part != 0).any()):
+                return degree
+        return 0
 
     @cached_property
     def finite(self) -> Tensor:

@@ -1,12 +1,12 @@
-"""Fixtures shared by all tests: the catalogue of scenes.
+"""Fixtures shared by all tests: the catalogue of scenes, and central differences.
 
-`scene` runs a test once per named scene; `make_scene("name")` builds one; both are in tests/scenes.py. That file is
-loaded by its path, because importlib mode puts no folder of tests on sys.path.
+`scene` runs a test once per named scene; `make_scene("name")` builds one; both are in tests/scenes.py. That file, like
+tests/differences.py, is loaded by its path, because importlib mode puts no folder of tests on sys.path.
 """
 
 import importlib.util
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import NamedTuple
 
@@ -24,6 +24,7 @@ def _load(name: str, path: Path):
 
 
 catalogue = _load("sgwarp_test_scenes", Path(__file__).with_name("scenes.py"))
+differences = _load("sgwarp_test_differences", Path(__file__).with_name("differences.py"))
 
 
 class NamedScene(NamedTuple):
@@ -48,3 +49,18 @@ def make_scene() -> Callable[[str], NamedScene]:
 def scenes():
     """The module tests/scenes.py itself, for its builders (cloud, pinhole, look_at, changed)."""
     return catalogue
+
+
+@pytest.fixture(scope="session")
+def assert_central_differences():
+    """Compare gradients with central differences of a float64 loss."""
+    return differences.assert_central_differences
+
+
+@pytest.fixture(scope="session", autouse=True)
+def cache_of_its_own(tmp_path_factory: pytest.TempPathFactory) -> Iterator[None]:
+    """No test reads or writes the maps that the user's own runs keep."""
+    folder = tmp_path_factory.mktemp("maps")
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setenv("SGWARP_CACHE", str(folder))
+        yield

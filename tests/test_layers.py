@@ -34,6 +34,8 @@ ORDER = (
     "ensemble",
     "render",
     "orbit",
+    "fitting",
+    "fit",
     "residual",
     "lift",
     "query",

@@ -1,5 +1,6 @@
 """Every notebook runs from top to bottom without a warning, and what it finds on the way is right."""
 
+import json
 import runpy
 from pathlib import Path
 
@@ -9,6 +10,7 @@ import nbformat
 import pytest
 import warp as wp
 
+from sgwarp.io.images import read_ids
 from sgwarp.ops import launch  # noqa: F401 - starts Warp quietly
 
 FOLDER = Path(__file__).resolve().parents[1] / "notebooks"
@@ -16,7 +18,7 @@ NOTEBOOKS = sorted(FOLDER.glob("*.py"))
 
 
 def test_there_are_notebooks():
-    assert FOLDER / "01_kernels.py" in NOTEBOOKS
+    assert {"01_kernels", "02_swap_in"} <= {path.stem for path in NOTEBOOKS}
 
 
 @pytest.mark.parametrize("path", NOTEBOOKS, ids=lambda path: path.stem)
@@ -79,3 +81,40 @@ def test_kernels(run, capsys):
     assert weighted[-1] > over_a_tenth[-1] > centre[-1] > 0.8
     for shares in found["coverage"].values():
         assert shares == sorted(shares)
+
+
+def test_swap_in(run):
+    found, figures = run("02_swap_in.py")
+    assert figures == 5
+    calls = {"gsplat's call", "Inria's call"}
+    assert found["image_differences"].keys() == found["losses"].keys() == calls
+    assert max(found["image_differences"].values()) < 5e-6
+    for differences in found["gradient_differences"].values():
+        assert differences.keys() == found["RATES"].keys()
+        assert max(differences.values()) < 2e-5
+    assert found["proxy_difference"] < 1e-6
+    assert found["seen"].sum() > 1000
+    assert found["same_bits"]
+    assert found["apart"][:40].max() < 1e-3
+    for name in calls:
+        losses = found["losses"][name]
+        assert losses[-12:].mean() < 0.2 * losses[:12].mean()
+        assert found["quality"][name] > 21
+
+
+def test_fit_and_ask(run, capsys):
+    found, figures = run("03_fit_and_ask.py")
+    assert figures == 4
+    assert "of the Gaussians were seen" in capsys.readouterr().out
+
+    curve = [point.psnr for point in found["fitted"].curve]
+    assert curve[-1] > 22
+    assert curve[-1] > curve[0] + 3
+    small, middle, large = (found["quality"][cap].psnr for cap in found["caps"])
+    assert small < middle < large
+    assert found["semantics"].coverage > 0.95
+    # The piano stands on the right of the first held-out view.
+    truth = read_ids(found["ROOM"] / "held_out" / "labels" / f"{found['view'].stem}.png")
+    names = json.loads((found["ROOM"] / "classes.json").read_text())
+    x, y = found["hits"]["piano"]
+    assert names[str(truth[y, x])] == "piano"

@@ -5,6 +5,8 @@ Only `sgwarp.cli` imports this package, once tyro is known to be there; torch an
 
 from sgwarp.commands.demo import Demo
 from sgwarp.commands.distill import Distill
+from sgwarp.commands.encoders import Encoders
+from sgwarp.commands.fit import Fit
 from sgwarp.commands.info import Info
 from sgwarp.commands.lift import Lift
 from sgwarp.commands.predict import Predict
@@ -14,6 +16,7 @@ from sgwarp.commands.report import Report
 from sgwarp.commands.segment import Segment
 
 COMMANDS = {
+    "fit": Fit,
     "lift": Lift,
     "distill": Distill,
     "predict": Predict,
@@ -21,6 +24,7 @@ COMMANDS = {
     "segment": Segment,
     "render": Render,
     "info": Info,
+    "encoders": Encoders,
     "report": Report,
     "demo": Demo,
 }

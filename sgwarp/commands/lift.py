@@ -4,10 +4,14 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Literal
+from typing import TYPE_CHECKING, Any, Literal
 
 from sgwarp.commands.options import SceneOptions, check_name, find_views
 from sgwarp.progress import show_progress
+
+if TYPE_CHECKING:
+    from sgwarp.runlog import RunLog
+    from sgwarp.scene import Gaussians, Semantics, View
 
 
 @dataclass(kw_only=True)
@@ -21,7 +25,14 @@ class Lift(SceneOptions):
     """Semantics file to write, .safetensors; run.json goes beside it."""
 
     encoder: str = "conse"
-    """Where the 2D semantics come from: the name of an encoder, or files:DIR for one file per view."""
+    """Where the 2D semantics come from, such as conse, clip:PATH+sam:PATH or files:DIR; `sgwarp encoders` lists all."""
+
+    cache: str = ""
+    """Folder in which feature maps are kept, so that the same views are encoded once; none for no cache. If not given,
+    $SGWARP_CACHE, or where caches belong on this platform (~/.cache/sgwarp/maps)."""
+
+    cache_limit: float = 10.0
+    """Size of that folder, at most [gigabytes]: the maps not used for longest go first."""
 
     mode: Literal["weighted", "center"] = "weighted"
     """weighted: all pixels a Gaussian contributes to; center: the pixel of its centre, with a depth test."""
@@ -44,28 +55,46 @@ class Lift(SceneOptions):
     def run(self) -> None:
         check_name("--out", self.out, ".safetensors")
         with self.logged(self.out.parent) as log:
-            from sgwarp.encoders.registry import make_encoder
+            from sgwarp.encoders.names import parse
             from sgwarp.io.store import save_semantics
-            from sgwarp.lift import lift
 
             gaussians = self.load_scene(log)
-            views = find_views(self.views, photographs=self.photographs)
-            with log.stage("load_encoder"):
-                source = make_encoder(self.encoder, views, self.device)
-            with show_progress("lift") as progress:
-                semantics = lift(
-                    gaussians,
-                    views,
-                    source,
-                    self.mode,
-                    tau=self.tau,
-                    border=self.border,
-                    share_of_views=self.share_of_views,
-                    deterministic=self.deterministic or None,
-                    progress=progress,
-                    log=log,
-                )
-            notes = {"encoder": self.encoder, "mode": self.mode, "views": len(views)}
+            source = parse(self.encoder)[0].source
+            if source.kind.name == "openscene":
+                from sgwarp.io.openscene import load_openscene
+
+                semantics = load_openscene(source.argument, gaussians, source.options.get("space"))
+                log.error["coverage"] = semantics.coverage
+                notes: dict[str, Any] = {"encoder": self.encoder}
+            else:
+                views = find_views(self.views, photographs=self.photographs)
+                semantics = self._lift(gaussians, views, log)
+                notes = {"encoder": self.encoder, "mode": self.mode, "views": len(views)}
             with log.stage("write"):
                 save_semantics(semantics, self.out, notes)
             log.outputs.append(str(self.out))
+
+    def _lift(self, gaussians: Gaussians, views: list[View], log: RunLog) -> Semantics:
+        from sgwarp.encoders.cache import CachedMaps, default_folder
+        from sgwarp.encoders.registry import make_encoder
+        from sgwarp.lift import lift
+
+        folder = None if self.cache == "none" else self.cache or default_folder()
+        with log.stage("load_encoder"):
+            source = make_encoder(self.encoder, views, self.device, folder, self.cache_limit)
+        with show_progress("lift") as progress:
+            semantics = lift(
+                gaussians,
+                views,
+                source,
+                self.mode,
+                tau=self.tau,
+                border=self.border,
+                share_of_views=self.share_of_views,
+                deterministic=self.deterministic or None,
+                progress=progress,
+                log=log,
+            )
+        if isinstance(source, CachedMaps):
+            log.leave_out("views_encoded_before", source.hits)
+        return semantics

@@ -17,6 +17,7 @@ from sgwarp.runlog import RunLog
 if TYPE_CHECKING:
     from torch import Tensor
 
+    from sgwarp.encoders.base import TextEncoder
     from sgwarp.scene import Gaussians, Semantics, View
 
 
@@ -83,12 +84,30 @@ class SemanticsOptions(SceneOptions):
     semantics: Path
     """What `sgwarp lift` wrote for this scene."""
 
+    encoder: str | None = None
+    """Encoder of the phrases; if not given, the one that the semantics were lifted with."""
+
+    templates: tuple[str, ...] = ()
+    """What phrases are put into, such as "a photo of a {}", or plain, photo, room; the encoder's own if not given."""
+
     predicted: Path | None = None
     """What `sgwarp predict` wrote for this scene; it is then asked together with the lifted semantics."""
 
     ensemble: Literal["2d", "3d", "max", "sum", "mean"] = "max"
     """How the scores of the lifted (2d) and the predicted (3d) semantics become one; where only one of them knows a
     Gaussian, it speaks for both."""
+
+    def text_encoder(self, semantics: Semantics) -> TextEncoder:
+        """The encoder of phrases in the space of the semantics.
+
+        Raises:
+            InputError: There is none, or it speaks another space.
+        """
+        from sgwarp.encoders.registry import text_encoder_for
+        from sgwarp.io.store import read_notes
+
+        name = self.encoder or read_notes(self.semantics).get("encoder")
+        return text_encoder_for(semantics.space, name, self.device, self.templates or None)
 
     def load_both(self, log: RunLog) -> tuple[Gaussians, Semantics]:
         """The scene and its semantics on the chosen device.

@@ -34,7 +34,10 @@ class Query(SemanticsOptions):
     """Mask to write, .png, 255 on what was found and 0 elsewhere; the heat map {out}_heat.png goes beside it."""
 
     score: Literal["cosine", "relevancy"] = "cosine"
-    """relevancy: how much better the text fits than "object", "things", "stuff" and "texture"."""
+    """relevancy: how much better the text fits than any of --canonical."""
+
+    canonical: tuple[str, ...] = ("object", "things", "stuff", "texture")
+    """What the text has to beat with --score relevancy."""
 
     threshold: float = 0.5
     """Least score of a pixel of the mask, where 0 is the scene's median score and 1 its best thousandth."""
@@ -74,19 +77,22 @@ class Query(SemanticsOptions):
 
     def _scores(self, semantics: Semantics, predicted: Semantics | None, log: RunLog) -> Tensor:
         """Score of every Gaussian on the scale of the mask, [N]."""
-        from sgwarp.encoders.registry import text_encoder_for
         from sgwarp.ensemble import combine, require_together, seen_by
         from sgwarp.query import class_votes, evidence, query, relevancy, rescale
 
         if semantics.labels is not None:
             return class_votes(semantics, [self.text], predicted=predicted, ensemble=self.ensemble)[:, 0]
         with log.stage("load_encoder"):
-            encoder = text_encoder_for(semantics.space)
+            encoder = self.text_encoder(semantics)
         with log.stage("query"):
-            score = query if self.score == "cosine" else relevancy
-            scores = evidence(score(semantics, [self.text], encoder), semantics)
+
+            def score(one: Semantics) -> Tensor:
+                if self.score == "cosine":
+                    return evidence(query(one, [self.text], encoder), one)
+                return evidence(relevancy(one, [self.text], encoder, self.canonical), one)
+
+            scores = score(semantics)
             if predicted is not None:
                 require_together(semantics, predicted)
-                others = evidence(score(predicted, [self.text], encoder), predicted)
-                scores = combine(scores, others, (semantics.seen, predicted.seen), self.ensemble)
+                scores = combine(scores, score(predicted), (semantics.seen, predicted.seen), self.ensemble)
             return rescale(scores, seen_by(semantics, predicted, self.ensemble))[:, 0]

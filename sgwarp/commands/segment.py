@@ -48,7 +48,6 @@ class Segment(SemanticsOptions):
             raise InputError(f"--unknown-below: expected a confidence from 0 to 1, got {self.unknown_below}")
         classes = None if self.classes is None else class_names(self.classes)
         with self.logged(self.out) as log:
-            from sgwarp.encoders.registry import text_encoder_for
             from sgwarp.ensemble import seen_by
             from sgwarp.query import class_votes
             from sgwarp.segment import segment_votes
@@ -59,7 +58,7 @@ class Segment(SemanticsOptions):
             encoder = None
             if classes is not None and semantics.labels is None:
                 with log.stage("load_encoder"):
-                    encoder = text_encoder_for(semantics.space)
+                    encoder = self.text_encoder(semantics)
             with log.stage("query"):
                 scoring = (self.temperature, self.scoring)
                 votes = class_votes(semantics, classes, encoder, *scoring, predicted=predicted, ensemble=self.ensemble)

@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Sequence
 from functools import cache
 from typing import Any
 
@@ -12,15 +11,16 @@ from torch import Tensor
 from torch.nn.functional import normalize
 
 from sgwarp.encoders.class_space import SPACE, imagenet_space
-from sgwarp.encoders.prompts import PLAIN, fill_templates
+from sgwarp.encoders.prompts import PLAIN, Phrases
+from sgwarp.encoders.weights import no_progress_bar
 from sgwarp.errors import InputError
 
 INSTALL = 'pip install "sgwarp[conse]"'
 BATCH = 64
 
 
-class ConseText:
-    """Unit vectors of phrases in the space of ConSE, as a TextEncoder.
+class ConseText(Phrases):
+    """Unit vectors of phrases, float32 [Q, 512], in the space of ConSE, as a TextEncoder.
 
     Args:
         templates: Prompts that a phrase is put into; their sentence embeddings are averaged. The plain phrase does best
@@ -30,22 +30,9 @@ class ConseText:
         InputError: The packages with the weights are not installed, or a template does not hold exactly one {}.
     """
 
-    space = SPACE
-
     def __init__(self, templates: Sequence[str] = PLAIN) -> None:
-        fill_templates((), templates)
+        super().__init__(SPACE, encode_sentences, templates, imagenet_space().place_texts)
         _sentence_model()
-        self.templates = tuple(templates)
-        self._known: dict[str, Tensor] = {}
-
-    def encode_text(self, texts: Sequence[str]) -> Tensor:
-        """Unit vectors, float32 [Q, 512], one per phrase."""
-        new = [text for text in dict.fromkeys(texts) if text not in self._known]
-        if new:
-            prompts = encode_sentences(fill_templates(new, self.templates))
-            means = normalize(prompts.unflatten(0, (len(new), len(self.templates))).mean(dim=1), dim=1)
-            self._known.update(zip(new, imagenet_space().place_texts(means), strict=True))
-        return torch.stack([self._known[text] for text in texts])
 
 
 def encode_sentences(sentences: Sequence[str]) -> Tensor:
@@ -77,21 +64,7 @@ def _sentence_model() -> tuple[Any, Any]:
     except ImportError as error:
         raise InputError(f"the text side of encoder conse needs the package {error.name}: {INSTALL}") from None
     folder = str(get_model_path())
-    with _no_progress_bar():
+    with no_progress_bar():
         tokenizer = AutoTokenizer.from_pretrained(folder, local_files_only=True)
         model = AutoModel.from_pretrained(folder, local_files_only=True)
     return tokenizer, model.eval()
-
-
-@contextmanager
-def _no_progress_bar() -> Iterator[None]:
-    """Loading takes less than a second; the bar of transformers would stand between our own lines."""
-    from transformers.utils import logging
-
-    shown = logging.is_progress_bar_enabled()
-    logging.disable_progress_bar()
-    try:
-        yield
-    finally:
-        if shown:
-            logging.enable_progress_bar()

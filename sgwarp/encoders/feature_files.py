@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import pickle
 import zipfile
+import zlib
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, Literal
@@ -34,6 +35,24 @@ def load_array(path: Path) -> NDArray[Any]:
             return np.lib.format.read_array(file, allow_pickle=False)
         except (ValueError, EOFError) as error:
             raise InputError(f"{path}: is not a NumPy array of numbers, or is cut short ({_line(error)})") from None
+
+
+def load_archive(path: Path) -> dict[str, NDArray[Any]]:
+    """The arrays in an .npz file by name.
+
+    Raises:
+        InputError: The file is missing, damaged or holds Python objects.
+    """
+    with reading(path), open(path, "rb") as file:
+        try:
+            with np.load(file, allow_pickle=False) as content:
+                if not isinstance(content, np.lib.npyio.NpzFile):
+                    raise InputError(f"{path}: holds a single array; expected an .npz of arrays")
+                return {name: content[name] for name in content.files}
+        except (ValueError, EOFError, KeyError, RuntimeError, zipfile.BadZipFile, zlib.error) as error:
+            if isinstance(error, InputError):
+                raise
+            raise InputError(f"{path}: is not an .npz of arrays, or is damaged ({_line(error)})") from None
 
 
 def load_features(path: Path) -> tuple[Tensor, Tensor | None]:
@@ -91,11 +110,10 @@ def _load_tensors(path: Path) -> dict[str, Tensor]:
     """Every array of a file by name; an unnamed one is called 'features'."""
     if path.suffix == ".npy":
         return {"features": _tensor(path, load_array(path))}
+    if path.suffix == ".npz":
+        return {name: _tensor(path, array) for name, array in load_archive(path).items()}
     with reading(path), open(path, "rb") as file:
         try:
-            if path.suffix == ".npz":
-                with np.load(file, allow_pickle=False) as archive:
-                    return {name: _tensor(path, archive[name]) for name in archive.files}
             if path.suffix == ".safetensors":
                 return _load_safetensors(path)
             content = torch.load(file, map_location="cpu", weights_only=True)

@@ -4,6 +4,7 @@
 |---|---|---|
 | {stem}.png | label or instance ids, 0 = unknown | one-hot ids in the space "labels" |
 | {stem}.npy, .npz, .pt, .pth or .safetensors | features, [C, h, w] or [h, w, C] | dense map |
+| {stem}_fmap_CxHxW.pt | features [C, h, w] (Feature 3DGS) | dense map |
 | {stem}_s.npy with {stem}_f.npy | ids [L, h, w], -1 = none; vectors [M, C] (LangSplat) | id map of L levels |
 
 A file space.json or meta.json beside them, {"space": "..."}, names the embedding space of the features.
@@ -28,6 +29,7 @@ from sgwarp.io.images import read_ids
 from sgwarp.scene import FeatureMap, View
 
 LABEL_SPACE = "labels"
+CHANNELS_FIRST = "_fmap_CxHxW.pt"  # Feature 3DGS says its layout in the name
 SPACE_FILES = ("space.json", "meta.json")
 
 Kind = Literal["labels", "dense", "levels"]
@@ -67,7 +69,7 @@ class FileMaps:
             raise InputError(f"{self.folder}: no such folder; give the one that holds a file per view")
         found = [(view, *self._find(view.stem)) for view in views if self.has_map(view)]
         if not found:
-            names = ", ".join(f"{{stem}}{suffix}" for suffix in (".png", *FEATURE_SUFFIXES, "_s.npy"))
+            names = ", ".join(f"{{stem}}{suffix}" for suffix in (".png", *FEATURE_SUFFIXES, CHANNELS_FIRST, "_s.npy"))
             raise InputError(f"{self.folder}: holds no map of any of the {len(views)} views; looked for {names}")
         first, self.kind, _ = found[0]
         for _, kind, path in found:
@@ -94,7 +96,7 @@ class FileMaps:
 
     def _candidates(self, stem: str) -> list[tuple[Kind, Path]]:
         kinds: list[tuple[Kind, str]] = [("labels", ".png"), ("levels", "_s.npy")]
-        kinds += [("dense", suffix) for suffix in FEATURE_SUFFIXES]
+        kinds += [("dense", suffix) for suffix in (*FEATURE_SUFFIXES, CHANNELS_FIRST)]
         files = [(kind, self.folder / f"{stem}{suffix}") for kind, suffix in kinds]
         return [(kind, path) for kind, path in files if path.is_file()]
 
@@ -146,7 +148,8 @@ class FileMaps:
 
     def _dense(self, path: Path, view: View) -> tuple[Tensor, Tensor | None]:
         features, valid = load_features(path)
-        return channels_last(path, features, view.camera.size, self.layout), valid
+        layout = "chw" if path.name.endswith(CHANNELS_FIRST) else self.layout
+        return channels_last(path, features, view.camera.size, layout), valid
 
     def _levels(self, path: Path, view: View) -> tuple[Tensor, Tensor]:
         """Ids, int64 [L, h, w], and vectors, float32 [M, C], of a LangSplat pair."""
@@ -186,38 +189,16 @@ def _require_shape(path: Path, shape: Sequence[int], view: View) -> None:
         raise InputError(f"{path}: is {shape[1]} x {shape[0]}, not the shape of view {view.stem} ({width} x {height})")
 
 
-def parse_options(name: str) -> tuple[str, dict[str, str]]:
-    """Split `DIR?layout=hwc&levels=1,2` into the folder and its options.
-
-    Raises:
-        InputError: An option has no value.
-    """
-    folder, _, tail = name.partition("?")
-    options = {}
-    for part in filter(None, tail.split("&")):
-        key, equals, value = part.partition("=")
-        if not (key and equals and value):
-            raise InputError(f"files:{name}: expected options as key=value, got '{part}'")
-        options[key] = value
-    return folder, options
-
-
-def open_files(name: str, views: Sequence[View]) -> FileMaps:
+def open_files(folder: str, views: Sequence[View], layout: str | None = None, levels: str | None = None) -> FileMaps:
     """The source behind `files:DIR`, `files:DIR?layout=hwc` (or chw) and `files:DIR?levels=1,2,3`.
 
     Raises:
-        InputError: An option is unknown or has a wrong value, or as FileMaps.
+        InputError: An option has a wrong value, or as FileMaps.
     """
-    folder, options = parse_options(name)
-    unknown = sorted(options.keys() - {"layout", "levels"})
-    if not folder or unknown:
-        wrong = f"unknown option '{unknown[0]}'" if unknown else "no folder given"
-        raise InputError(f"files:{name}: {wrong}; write files:DIR, with ?layout=hwc, chw or ?levels=1,2 if needed")
-    layout = options.get("layout")
     if layout not in (None, "chw", "hwc"):
-        raise InputError(f"files:{name}: layout is chw or hwc, not '{layout}'")
+        raise InputError(f"files:{folder}: layout is chw or hwc, not '{layout}'")
     try:
-        levels = [int(level) for level in options["levels"].split(",")] if "levels" in options else None
+        chosen = [int(level) for level in levels.split(",")] if levels else None
     except ValueError:
-        raise InputError(f"files:{name}: levels are numbers such as 1,2,3, not '{options['levels']}'") from None
-    return FileMaps(folder, views, layout=layout, levels=levels)  # type: ignore[arg-type]
+        raise InputError(f"files:{folder}: levels are numbers such as 1,2,3, not '{levels}'") from None
+    return FileMaps(folder, views, layout=layout, levels=chosen)  # type: ignore[arg-type]

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 
 import torch
@@ -11,8 +12,8 @@ from torch.nn.functional import pad
 
 from sgwarp.kernels import compositing_block_backward, compositing_lanes_backward, harmonics_backward
 from sgwarp.kernels import projection_backward as kernels
-from sgwarp.kernels.compositing_lanes_backward import MOMENTS, SUMS, row_columns
-from sgwarp.kernels.transmittance import Lanes
+from sgwarp.kernels.compositing_lanes_backward import MOMENTS, row_columns
+from sgwarp.kernels.transmittance import LaneIds, Lanes
 from sgwarp.ops import tiles
 from sgwarp.ops.launch import get_threads, launch, launch_blocks, scratch, view
 from sgwarp.ops.lift import LiftSums, add_weighted
@@ -86,8 +87,8 @@ def composite_backward(
     """Differentiate `composite_recorded`.
 
     Args:
-        lists: Kept tile lists of the view.
-        features: What was composited if it did not travel with the fragments, [N, C].
+        lists: Kept tile lists of the view, with places.
+        features: What was composited if it did not travel with the splats, [N, C].
         channels: Of the image.
         recorded: Transmittance, `last` and `hit` as compositing returned them.
         gradients: Of the loss.
@@ -110,7 +111,7 @@ def composite_backward(
     sums = torch.zeros(count, LANE, device=device)
     rows = scratch("backward rows", lists.intersections * LANE if ordered else 0, torch.float32, device).view(-1, LANE)
     slices = in_slices(features if wide and features is not None else zeros[:1, :1])
-    head = [view(lists.offsets, wp.int32), lists.fragments]
+    head = lists.arrays()
     size = [tiles.knobs(settings), camera.width, camera.height]
     if block:
         maps = [view(t.contiguous(), wp.float32) for t in (transmittance, v_transmittance, v_image, v_depth)]
@@ -119,31 +120,27 @@ def composite_backward(
         outputs = [view(rows if ordered else sums, wp.float32)]
         launch_blocks(kernel, [lists.tile_count], inputs, outputs, device=device)
     else:
-        shape = (camera.height, -(-camera.width // LANE), -1, LANE)
-        room = shape[0] * shape[1] * LANE
-        pixels = scratch("backward pixels", room * 3, torch.float32, device).view(shape)
-        for plane, (image, outside) in enumerate(((transmittance, 1.0), (v_transmittance, 0.0), (last, -1.0))):
-            _in_lanes(image[..., None], pixels[:, :, plane : plane + 1], outside)
-        padded = slices.shape[1] * LANE if wide else 3
-        gradient = scratch("backward gradient", room * (padded + depth), torch.float32, device).view(shape)
-        _in_lanes(v_image, gradient[:, :, :padded])
+        shape = (camera.height, -(-camera.width // LANE), (slices.shape[1] * LANE if wide else 3) + depth, LANE)
+        gradient = scratch("backward gradient", math.prod(shape), torch.float32, device).view(shape)
+        _channels_in_lanes(v_image, gradient[:, :, : shape[2] - depth])
         if depth:
-            _in_lanes(v_depth[..., None], gradient[:, :, padded:])
+            _channels_in_lanes(v_depth[..., None], gradient[:, :, shape[2] - 1 :])
+        maps = [view(_in_lanes(transmittance, 1.0), Lanes), view(_in_lanes(v_transmittance, 0.0), Lanes)]
+        maps += [view(_in_lanes(last, -1), LaneIds), view(gradient, Lanes)]
         scratches = [
             lane_scratch("backward state", TILE_ROWS, 2, device),
             view(scratch("reach", get_threads() * TILE_ROWS, torch.int32, device).view(-1, TILE_ROWS), wp.int32),
-            lane_scratch("backward sums", LANE, SUMS, device),
         ]
-        inputs = [*head, view(slices.unsqueeze(2), Lanes), view(pixels, Lanes), view(gradient, Lanes), *size]
+        inputs = [*head, view(slices.unsqueeze(2), Lanes), *maps, *size]
         kernel = compositing_lanes_backward.make_composite_backward(wide, depth, absolute)
         launch(kernel, lists.tile_count, [*inputs, *scratches], [view(rows, Lanes)], device=device, slots=True)
     if ordered:
-        inputs = [view(lists.order, wp.int32), view(lists.entries, wp.int32), view(rows, Lanes)]
-        outputs = [view(sums, Lanes)]
-        launch(kernels.sum_intersections, len(lists.order), inputs, outputs, device=device)
+        inputs = [*lists.sums(), view(rows, Lanes)]
+        launch(kernels.sum_intersections, len(lists.order), inputs, [view(sums, Lanes)], device=device)
     if gradients.surface is not None:
-        seen = hit >= 0
-        sums[:, at_depth].index_add_(0, hit[seen].to(torch.int64), gradients.surface[seen])
+        # Pixels without a surface add zero to the first Gaussian: choosing the others would wait for the device.
+        at_hit = torch.where(hit >= 0, gradients.surface, 0.0).flatten()
+        sums[:, at_depth].index_add_(0, hit.clamp(min=0).flatten().to(torch.int64), at_hit)
     if not wide:
         v_features = sums[:, MOMENTS : MOMENTS + channels]
     else:
@@ -153,17 +150,17 @@ def composite_backward(
     return SplatGradients(sums, at_depth if depth else -1, v_features, magnitudes)
 
 
-def _in_lanes(image: Tensor, out: Tensor, outside: float = 0.0) -> None:
-    """Write an image [H, W, C] with 16 pixels of a row in a vector, `out` is [H, tile columns, C or more, 16].
+def _in_lanes(image: Tensor, outside: float) -> Tensor:
+    """An image [H, W] with 16 pixels of a row in a vector, [H, tile columns, 16]; beyond its edge it is `outside`."""
+    return pad(image, (0, -image.shape[1] % LANE), value=outside).contiguous().unflatten(1, (-1, LANE))
 
-    Pixels beyond its edge are `outside`, channels beyond its last are zero.
-    """
+
+def _channels_in_lanes(image: Tensor, out: Tensor) -> None:
+    """Write an image [H, W, C] to `out` [H, tile columns, C or more, 16]; the rest becomes zero."""
     _, columns, channels, _ = out.shape
     height, width, given = image.shape
-    if width % LANE:
-        image = pad(image, (0, 0, 0, columns * LANE - width), value=outside)
-    if given < channels:
-        image = pad(image, (0, channels - given))
+    if (given, width) != (channels, columns * LANE):
+        image = pad(image, (0, channels - given, 0, columns * LANE - width))
     out.copy_(image.reshape(height, columns, LANE, channels).transpose(2, 3))
 
 
@@ -193,14 +190,11 @@ def project_backward(
 ) -> GaussianGradients:
     """Differentiate `tiles.project`; `pose` asks for each Gaussian's share of the pose's gradient."""
     n, device = len(gaussians), gaussians.device
-    result = GaussianGradients(
-        means=torch.zeros(n, 3, device=device),
-        quats=torch.zeros(n, 4, device=device),
-        scales=torch.zeros(n, 3, device=device),
-        opacities=torch.zeros(n, device=device),
-        means2d=torch.zeros(n, 2, device=device),
-        poses=torch.zeros(n if pose else 0, kernels.POSE_COLUMNS, device=device),
+    means, quats, scales, opacities, means2d, poses = (
+        torch.empty(*shape, device=device)
+        for shape in ((n, 3), (n, 4), (n, 3), (n,), (n, 2), (n if pose else 0, kernels.POSE_COLUMNS))
     )
+    result = GaussianGradients(means, quats, scales, opacities, means2d, poses)
     inputs = [
         view(gaussians.means, wp.vec3),
         view(gaussians.quats, wp.vec4),
@@ -226,9 +220,9 @@ def project_backward(
 def shade_backward(
     gaussians: Gaussians,
     camera: Camera,
-    settings: RasterSettings,
     splats: SplatGradients,
     v_means: Tensor,
+    degree: int,
     *,
     pose: bool = False,
 ) -> tuple[Tensor, Tensor]:
@@ -239,9 +233,8 @@ def shade_backward(
         empty.
     """
     n, device = len(gaussians), gaussians.device
-    degree = gaussians.sh_degree if settings.sh_degree is None else min(settings.sh_degree, gaussians.sh_degree)
-    v_sh = torch.zeros_like(gaussians.sh)
-    v_offsets = torch.zeros(n if pose else 0, 3, device=device)
+    v_sh = torch.empty_like(gaussians.sh)
+    v_offsets = torch.empty(n if pose else 0, 3, device=device)
     inputs = [
         view(gaussians.means, wp.vec3),
         view(gaussians.sh, wp.vec3),
@@ -256,24 +249,23 @@ def shade_backward(
 
 
 def pose_gradient(camera: Camera, poses: Tensor, v_offsets: Tensor | None) -> Tensor:
-    """Gradient of the world-to-camera matrix, float64 [4, 4] on the CPU, from every Gaussian's share.
+    """Gradient of the world-to-camera matrix, float64 [4, 4], from every Gaussian's share.
 
     Args:
         poses: Of the rotation about the camera's centre and of the translation, [N, 12].
         v_offsets: Of each centre seen from the camera's, [N, 3], where colours depend on the direction.
     """
-    total = _sum_rows(poses).cpu()
+    total = _sum_rows(poses)
     v_translation = total[9:]
-    center = camera.position
-    gradient = torch.zeros(4, 4, dtype=torch.float64)
+    pose, center = camera.world_to_camera.to(poses.device), camera.position.to(poses.device)
+    gradient = torch.zeros(4, 4, dtype=torch.float64, device=poses.device)
     # p = R m + t, and m = (m - center) + center.
     gradient[:3, :3] = total[:9].view(3, 3) + torch.outer(v_translation, center)
     gradient[:3, 3] = v_translation
     if v_offsets is not None:
-        v_center = -_sum_rows(v_offsets).cpu()
-        rotation, translation = camera.world_to_camera[:3, :3], camera.world_to_camera[:3, 3]
-        gradient[:3, :3] -= torch.outer(translation, v_center)
-        gradient[:3, 3] -= rotation @ v_center
+        v_center = -_sum_rows(v_offsets)
+        gradient[:3, :3] -= torch.outer(pose[:3, 3], v_center)
+        gradient[:3, 3] -= pose[:3, :3] @ v_center
     return gradient
 
 

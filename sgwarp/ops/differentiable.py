@@ -10,12 +10,14 @@ from torch import Tensor
 
 from sgwarp.errors import InputError
 from sgwarp.ops import backward, tiles
-from sgwarp.ops.rasterize import Rendering, composite_recorded, packed_colors, rasterize
+from sgwarp.ops import rasterize as forward
+from sgwarp.ops.plan import RenderPlan, plan_render
+from sgwarp.ops.rasterize import Rendering, composite_recorded, packed_colors
 from sgwarp.ops.settings import RasterSettings
 from sgwarp.scene import SH_COUNTS, Camera, Gaussians
 
 
-def rasterize_differentiable(
+def rasterize(
     means: Tensor,
     quats: Tensor,
     scales: Tensor,
@@ -40,7 +42,7 @@ def rasterize_differentiable(
 ) -> Rendering:
     """Render a view (paper eq. 1) with gradients to every tensor but K.
 
-    The same image as `rasterize`. Gaussians that are left out, among them all that are not finite, get gradients of
+    The same image as `sg.render`. Gaussians that are left out, among them all that are not finite, get gradients of
     exactly zero. On the CPU gradients have the same bits for any number of threads.
 
     Args:
@@ -58,14 +60,15 @@ def rasterize_differentiable(
         means2d: float [N, 2], added to the projected centres as far as gradients go: its values are not read, and its
             gradient is that of the projected centres [1 / pixels], which densification looks at.
         absgrad: Also add the sum over pixels of the magnitude of each one's gradient to `means2d.absgrad` (AbsGS).
-        expected_depth, depth: Which depths to render, as in `rasterize`; both have gradients.
+        expected_depth, depth: Which depths to render, as in `sg.render`; both have gradients.
         near, far: Range of depth that is rendered [m].
         settings: The approximations.
         schedule: "lanes" or "block", by default the device's own; either runs on the CPU.
         deterministic: Add gradients up in a fixed order. The CPU always does; on CUDA the default is atomic additions.
 
     Raises:
-        InputError: Shapes do not fit, a scale is negative, an opacity outside [0, 1], or the camera is not valid.
+        InputError: Shapes do not fit, or the camera is not valid; on the CPU also: a scale is negative or an opacity
+            outside [0, 1].
     """
     if (sh is None) == (features is None):
         raise InputError("give exactly one of sh [N, K, 3] and features [N, C]")
@@ -84,12 +87,13 @@ def rasterize_differentiable(
     if background is not None and tuple(background.shape) != (channels,):
         raise InputError(f"background: expected shape [{channels}], got {list(background.shape)}")
 
+    _check_fields(means, quats, scales, opacities)
     camera = Camera(K, viewmat, width, height, near, far)
     inputs = (means, quats, scales, opacities, values, viewmat, means2d, background)
     if not (torch.is_grad_enabled() and any(t is not None and t.requires_grad for t in inputs)):
         colors = means.new_zeros(n, 1, 3) if sh is None else sh
         gaussians = Gaussians(means, quats, scales, opacities, colors)
-        return rasterize(
+        return forward.rasterize(
             gaussians,
             camera,
             features,
@@ -98,9 +102,17 @@ def rasterize_differentiable(
             depth=depth,
             settings=settings,
         )
-    request = _Request(
-        camera, settings, sh is not None, expected_depth or depth, means2d if absgrad else None, schedule, deterministic
+    receives_absgrad = means2d if absgrad else None
+    plan = plan_render(
+        Gaussians.unchecked(means, quats, scales, opacities, means.new_zeros(n, 1, 3) if sh is None else sh),
+        "colors" if features is None else "features",
+        channels=channels,
+        depth=expected_depth or depth,
+        record=True,
+        settings=settings,
+        look=False,
     )
+    request = _Request(camera, settings, plan, receives_absgrad, schedule, deterministic)
     means, quats, scales, opacities, values = (
         t.to(torch.float32).contiguous() for t in (means, quats, scales, opacities, values)
     )
@@ -113,7 +125,23 @@ def rasterize_differentiable(
     mean_depth = None
     if expected_depth:
         mean_depth = torch.where(alpha > 0, depth_sum / alpha.clamp(min=1e-12), 0.0)
-    return Rendering(image, alpha, mean_depth, surface if depth else None, request.culled)
+    return Rendering(image, alpha, mean_depth, surface if depth else None, request.status_counts)
+
+
+def _check_fields(means: Tensor, quats: Tensor, scales: Tensor, opacities: Tensor) -> None:
+    """Shapes and types always; values on the CPU only, since on CUDA to look at them is to wait for the device."""
+    n = len(means)
+    fields = {"means": (means, (n, 3)), "quats": (quats, (n, 4)), "scales": (scales, (n, 3))}
+    for name, (tensor, shape) in (fields | {"opacities": (opacities, (n,))}).items():
+        if tuple(tensor.shape) != shape or not tensor.is_floating_point():
+            got = f"{tensor.dtype} {list(tensor.shape)}"
+            raise InputError(f"{name}: expected floating point {list(shape)}, got {got}")
+    if n == 0 or means.is_cuda:
+        return
+    with torch.no_grad():
+        lowest, highest = opacities.aminmax()
+        if not (scales.min() >= 0 and lowest >= 0 and highest <= 1):  # or NaN, which is no error
+            Gaussians(means, quats, scales, opacities, means.new_zeros(n, 1, 3))
 
 
 @dataclass(eq=False)
@@ -122,12 +150,16 @@ class _Request:
 
     camera: Camera
     settings: RasterSettings
-    harmonics: bool  # the values are coefficients
-    wants_depth: bool
+    plan: RenderPlan
     receives_absgrad: Tensor | None
     schedule: str | None
     deterministic: bool | None
-    culled: dict[str, int] = field(default_factory=dict)
+    status_counts: Tensor = field(default_factory=lambda: torch.empty(0, dtype=torch.int64))
+
+    @property
+    def harmonics(self) -> bool:
+        """Whether the values are coefficients."""
+        return self.plan.values == "colors"
 
 
 class _Rasterize(torch.autograd.Function):
@@ -150,14 +182,14 @@ class _Rasterize(torch.autograd.Function):
         features = None if request.harmonics else values
         projected = tiles.project(gaussians, camera, settings)
         order = tiles.depth_order(projected)
-        colors = packed_colors(gaussians, camera, features, order, settings)
-        lists = tiles.bin_splats(projected, order, colors, camera, settings, keep=True)
+        colors = packed_colors(gaussians, camera, features, order, request.plan)
+        lists = tiles.bin_splats(projected, order, colors, camera, places=True, keep=True)
         image, transmittance, depth_sum, surface, last, hit = composite_recorded(
-            lists, camera, settings, features, request.wants_depth, request.schedule
+            lists, camera, settings, features, request.plan.depth, request.schedule
         )
-        request.culled = projected.culled()
-        kept = (lists.order, lists.entries, lists.offsets, lists.memory, transmittance, last, hit)
-        ctx.save_for_backward(means, quats, scales, opacities, values, viewmat, *kept)
+        request.status_counts = projected.counts()
+        recorded = (transmittance, last, hit)
+        ctx.save_for_backward(means, quats, scales, opacities, values, viewmat, *recorded, *vars(lists).values())
         ctx.request = request
         ctx.channels = image.shape[2]
         ctx.set_materialize_grads(False)
@@ -174,18 +206,16 @@ class _Rasterize(torch.autograd.Function):
     ) -> tuple[Tensor | None, ...]:
         request: _Request = ctx.request
         camera, settings = request.camera, request.settings
-        means, quats, scales, opacities, values, viewmat, order, entries, offsets, memory, *recorded = ctx.saved_tensors
+        means, quats, scales, opacities, values, viewmat, *kept = ctx.saved_tensors
         gaussians = _gaussians(means, quats, scales, opacities, values, request)
-        fragments = tiles.as_fragments(memory)
-        nothing = order[:0]
-        lists = tiles.TileLists(order, entries, offsets, fragments, fragments.size, nothing, nothing, memory)
+        recorded, lists = (kept[0], kept[1], kept[2]), tiles.TileLists(*kept[3:])
         splats = backward.composite_backward(
             lists,
             camera,
             settings,
             None if request.harmonics else values,
             ctx.channels,
-            tuple(recorded),
+            recorded,
             backward.ImageGradients(v_image, v_transmittance, v_depth_sum, v_surface),
             len(means),
             absolute=request.receives_absgrad is not None,
@@ -196,7 +226,8 @@ class _Rasterize(torch.autograd.Function):
         result = backward.project_backward(gaussians, camera, settings, splats, pose=pose)
         v_values, v_offsets = splats.features, None
         if request.harmonics:
-            v_values, v_offsets = backward.shade_backward(gaussians, camera, settings, splats, result.means, pose=pose)
+            degree = request.plan.sh_degree
+            v_values, v_offsets = backward.shade_backward(gaussians, camera, splats, result.means, degree, pose=pose)
         v_viewmat = backward.pose_gradient(camera, result.poses, v_offsets).to(viewmat) if pose else None
         if request.receives_absgrad is not None:
             _accumulate(request.receives_absgrad, splats.absolute)
@@ -216,7 +247,7 @@ def _gaussians(
     means: Tensor, quats: Tensor, scales: Tensor, opacities: Tensor, values: Tensor, request: _Request
 ) -> Gaussians:
     sh = values if request.harmonics else means.new_zeros(len(means), 1, 3)
-    return Gaussians(means.detach(), quats.detach(), scales.detach(), opacities.detach(), sh.detach())
+    return Gaussians.unchecked(*(t.detach() for t in (means, quats, scales, opacities, sh)))
 
 
 def _accumulate(tensor: Tensor, absolute: Tensor | None) -> None:

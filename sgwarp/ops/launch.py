@@ -187,15 +187,6 @@ def scratch(name: str, count: int, dtype: torch.dtype, device: torch.device) -> 
     return held[:count]
 
 
-def scratch_structs(name: str, count: int, struct: Any, device: torch.device) -> Any:
-    """Scratch memory as an array of a Warp struct."""
-    size = wp.types.type_size_in_bytes(struct)
-    memory = scratch(name, count * size // 4, torch.int32, device)
-    return wp.array(
-        ptr=memory.data_ptr(), dtype=struct, shape=(count,), capacity=count * size, device=wp.device_from_torch(device)
-    )
-
-
 def release_scratch() -> None:
     """Give the calling thread's scratch memory back."""
     _local.__dict__.pop("store", None)

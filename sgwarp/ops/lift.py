@@ -25,6 +25,7 @@ from sgwarp.scene import Camera, FeatureMap, Gaussians
 MODES = ("weighted", "center")
 WIDE = 4  # slices of 16 channels lifted in one walk over the tiles
 ROW_BYTES = 512 * 2**20  # at most this much scratch for the rows of all intersections
+SLICE_BYTES = 512 * 2**20  # at most this much for slices that have to be brought to the size of the image
 
 
 @dataclass(eq=False)
@@ -91,7 +92,9 @@ def lift_view(
         raise InputError(f"feature map: {got}, but the sums hold {sums.channels} for {len(sums.weight)}")
     projected = tiles.project(gaussians, camera, settings)
     order = tiles.depth_order(projected)
-    lists = tiles.bin_splats(projected, order, None, camera, settings, places=feature_map.ids is not None)
+    by_rows = mode == "weighted"
+    wants_tiles = by_rows and feature_map.ids is not None
+    lists = tiles.bin_splats(projected, order, None, camera, places=by_rows, tiles=wants_tiles)
     if mode == "center":
         _add_centers(projected, lists, camera, feature_map, sums, tau, border, settings)
         return
@@ -132,6 +135,8 @@ def _add_dense(
     total_slices = sums.slices.shape[1]
     # A pass of four slices shares one walk over the tiles; with very many intersections its rows must stay small.
     affordable = max(1, ROW_BYTES // max(1, 64 * lists.intersections))
+    if not _ready(feature_map, camera, device):  # a slice and its copy in the order of the kernel
+        affordable = min(affordable, SLICE_BYTES // (2 * 64 * camera.height * camera.width))
     first = 0
     while first < total_slices:
         count = WIDE if total_slices - first >= WIDE and affordable >= WIDE else 1
@@ -157,7 +162,7 @@ def _add_dense_pass(
     height, width = camera.size
     total = lists.intersections
     first_feature, first, count = place
-    common = [view(lists.offsets, wp.int32), lists.fragments, view(features, Lanes)]
+    common = [*lists.arrays(), view(features, Lanes)]
     knobs = tiles.knobs(settings)
     rows = scratch("rows", total * count * LANE if ordered else 0, torch.float32, device).view(-1, count, LANE)
     weights = scratch("entry weights", total if ordered else 0, torch.float32, device)
@@ -183,7 +188,7 @@ def _add_dense_pass(
         outputs = [view(rows, Lanes), view(weights, wp.float32)]
         kernel = lifting_lanes.make_lift_dense(count)
         launch(kernel, lists.tile_count, inputs, outputs, device=device, slots=True)
-    gather = [view(lists.order, wp.int32), view(lists.entries, wp.int32)]
+    gather = lists.sums()
     visible = len(lists.order)
     launch(
         lifting.sum_rows, visible, [*gather, view(rows, Lanes), first, count], [view(sums.slices, Lanes)], device=device
@@ -202,19 +207,27 @@ def _slices_at_image_size(
     """
     dense, valid = feature_map.dense, feature_map.valid
     assert dense is not None
-    at_size = feature_map.size == camera.size
-    ready = at_size and valid is None and dense.dtype == torch.float32 and dense.shape[2] % LANE == 0
-    if ready and dense.device == device and dense.is_contiguous():
+    if _ready(feature_map, camera, device):
         return in_slices(dense), first
+    at_size = feature_map.size == camera.size
     part = dense[..., LANE * first : LANE * (first + count)].to(device=device, dtype=torch.float32)
     if valid is not None:
         part = torch.where(valid.to(device)[..., None], part, 0.0)
     if not at_size:
-        part = interpolate(part.permute(2, 0, 1)[None], camera.size, mode="bilinear", align_corners=False)[0]
+        channels_first = part.permute(2, 0, 1).contiguous()  # five times as fast as a strided view
+        part = interpolate(channels_first[None], camera.size, mode="bilinear", align_corners=False)[0]
         part = part.permute(1, 2, 0)
         if valid is not None:  # the mean of the valid neighbours, not of the zeros between them
             part = part / _valid_pixels(feature_map, camera, device).clamp(min=1e-6)[..., None]
     return in_slices(part), 0
+
+
+def _ready(feature_map: FeatureMap, camera: Camera, device: torch.device) -> bool:
+    """Whether a dense map can be lifted as it lies in memory."""
+    dense = feature_map.dense
+    assert dense is not None
+    plain = feature_map.size == camera.size and feature_map.valid is None and dense.dtype == torch.float32
+    return plain and dense.shape[2] % LANE == 0 and dense.device == device and dense.is_contiguous()
 
 
 def _valid_pixels(feature_map: FeatureMap, camera: Camera, device: torch.device) -> Tensor:
@@ -265,7 +278,7 @@ def _add_ids(
         rows = len(sums.weight) if atomic else visible
         id_weights = scratch("id weights", rows * known, torch.float32, device).view(rows, known).zero_()
     knobs = tiles.knobs(settings)
-    common = [view(lists.offsets, wp.int32), lists.fragments]
+    common = lists.arrays()
     row_places = view(row_starts, wp.int32)
     if atomic:
         view_weights = torch.zeros_like(sums.weight)
@@ -290,7 +303,7 @@ def _add_ids(
         order = view(torch.arange(len(sums.weight), dtype=torch.int32, device=device), wp.int32)
         visible = len(sums.weight)
     else:
-        where = [view(t, wp.int32) for t in (lists.entries, starts, lists.tiles)]
+        where = [view(t, wp.int32) for t in (lists.entries, lists.places, starts, lists.tiles)]
         names = [view(tile_ids, wp.int32), view(id_counts, wp.int32), view(weights, wp.float32)]
         outputs = [view(t, wp.float32) for t in (id_weights, sums.weight, sums.weight_squared)]
         launch(lifting.sum_id_weights, visible, [order, *where, *names, int(one_hot)], outputs, device=device)

@@ -9,10 +9,11 @@ import warp as wp
 from torch import Tensor
 
 from sgwarp.errors import InputError
-from sgwarp.kernels import compositing_block, compositing_lanes, compositing_lanes_record
+from sgwarp.kernels import binning, compositing_block, compositing_lanes
 from sgwarp.kernels.transmittance import Lanes
 from sgwarp.ops import tiles
 from sgwarp.ops.launch import get_threads, launch, launch_blocks, scratch, view
+from sgwarp.ops.plan import RenderPlan, Values, plan_render
 from sgwarp.ops.settings import RasterSettings
 from sgwarp.scene import Camera, Gaussians
 
@@ -30,14 +31,19 @@ class Rendering:
         expected_depth: Mean z weighted by alpha T [m], 0 where nothing is, float32 [H, W]; None if not asked for.
         depth: z of the Gaussian at which accumulated opacity passes `surface_opacity` [m], 0 = no hit, float32 [H, W];
             None if not asked for.
-        culled: Gaussians left out, by reason.
+        status_counts: How many Gaussians had each status of kernels/projection.py, int64.
     """
 
     features: Tensor
     alpha: Tensor
     expected_depth: Tensor | None
     depth: Tensor | None
-    culled: dict[str, int]
+    status_counts: Tensor
+
+    @property
+    def culled(self) -> dict[str, int]:
+        """Gaussians left out, by reason; reading it waits for the device."""
+        return tiles.culled(self.status_counts)
 
 
 def rasterize(
@@ -49,6 +55,7 @@ def rasterize(
     expected_depth: bool = False,
     depth: bool = False,
     settings: RasterSettings = RasterSettings(),  # noqa: B008 - frozen
+    plan: RenderPlan | None = None,
 ) -> Rendering:
     """Render a view (paper eq. 1): project, order by (depth, index), list per tile, composite front to back.
 
@@ -59,6 +66,7 @@ def rasterize(
         background: float32 [C], seen through what is left transparent; None is zero.
         expected_depth, depth: Which depths to render; without them nothing is computed for them.
         settings: The approximations.
+        plan: What to compute, and what not; derived from the scene and the request if None.
 
     Raises:
         InputError: `features` or `background` do not fit.
@@ -72,27 +80,32 @@ def rasterize(
     if background is not None and tuple(background.shape) != (channels,):
         raise InputError(f"background: expected shape [{channels}], got {list(background.shape)}")
 
+    if plan is None:
+        values: Values = "colors" if features is None else "features"
+        wants_depth = expected_depth or depth
+        plan = plan_render(gaussians, values, channels=channels, depth=wants_depth, settings=settings)
     projected = tiles.project(gaussians, camera, settings)
     order = tiles.depth_order(projected)
-    colors = packed_colors(gaussians, camera, features, order, settings)
-    lists = tiles.bin_splats(projected, order, colors, camera, settings)
-    wants_depth = expected_depth or depth
-    image, transmittance, depth_sum, surface = composite(lists, camera, settings, features, wants_depth)
+    colors = packed_colors(gaussians, camera, features, order, plan)
+    lists = tiles.bin_splats(projected, order, colors, camera)
+    image, transmittance, depth_sum, surface = composite(lists, camera, settings, features, plan.depth)
     if background is not None:
         image = image + transmittance[..., None] * background.to(image)
     alpha = 1.0 - transmittance
     mean_depth = None
     if expected_depth:
         mean_depth = torch.where(alpha > 0, depth_sum / alpha.clamp(min=1e-12), 0.0)
-    return Rendering(image, alpha, mean_depth, surface if depth else None, projected.culled())
+    return Rendering(image, alpha, mean_depth, surface if depth else None, projected.counts())
 
 
 def packed_colors(
-    gaussians: Gaussians, camera: Camera, features: Tensor | None, order: Tensor, settings: RasterSettings
+    gaussians: Gaussians, camera: Camera, features: Tensor | None, order: Tensor, plan: RenderPlan
 ) -> Tensor | None:
-    """Colours by depth order. Three channels travel with the fragments; more are gathered while compositing."""
+    """Colours by depth order. Three channels travel with the splats; more are gathered while compositing."""
+    if plan.values == "nothing":
+        return None
     if features is None:
-        return tiles.shade(gaussians, camera, order, settings)
+        return tiles.shade(gaussians, camera, order, plan.sh_degree)
     if features.shape[1] > 3:
         return None
     padded = torch.zeros(len(order), 3, dtype=torch.float32, device=gaussians.device)
@@ -112,7 +125,8 @@ def composite(
 
     `schedule` is "lanes" or "block", by default the device's own; either runs on the CPU.
     """
-    return _composite(lists, camera, settings, features, wants_depth, schedule, None, None)
+    nothing = torch.empty(0, 0, dtype=torch.int32, device=lists.order.device)
+    return _composite(lists, camera, settings, features, wants_depth, schedule, nothing, nothing)
 
 
 def composite_recorded(
@@ -125,7 +139,7 @@ def composite_recorded(
 ) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor, Tensor]:
     """`composite` and what its backward pass starts from, int32 [H, W] each.
 
-    `last` is the last contributing fragment, counted from the first of its tile; `hit` is the Gaussian that gave the
+    `last` is the last contributor, counted from the first of its tile; `hit` is the Gaussian that gave the
     surface depth, empty without `wants_depth`. Both are -1 where there is none.
     """
     device = lists.order.device
@@ -146,8 +160,8 @@ def _composite(
     features: Tensor | None,
     wants_depth: bool,
     schedule: str | None,
-    last: Tensor | None,
-    hit: Tensor | None,
+    last: Tensor,
+    hit: Tensor,
 ) -> tuple[Tensor, Tensor, Tensor, Tensor]:
     device = lists.order.device
     block = runs_in_blocks(device, schedule)
@@ -162,20 +176,19 @@ def _composite(
         image = _composite_wide(lists, camera, settings, features, transmittance, last, block)
     if not wide or wants_depth:
         colors = torch.empty(height, width, 3, device=device)
-        inputs = [view(lists.offsets, wp.int32), lists.fragments, tiles.knobs(settings), width, height]
+        inputs = [*lists.arrays(), tiles.knobs(settings), width, height]
         outputs = [view(colors, wp.vec3), *(view(t, wp.float32) for t in (transmittance, depth_sum, surface))]
-        if last is not None and hit is not None:
-            outputs += [view(last, wp.int32), view(hit, wp.int32)]
+        outputs += [view(last, wp.int32), view(hit, wp.int32)]
+        record = len(last) > 0
         if block:
-            make = compositing_block.make_composite_colors_block
-            kernel = (make if last is None else compositing_block.make_record_colors_block)(wants_depth)
+            kernel = compositing_block.make_composite_colors_block(wants_depth, record)
             launch_blocks(kernel, [lists.tile_count], inputs, outputs, device=device)
         else:
-            make = compositing_lanes.make_composite_colors
-            kernel = (make if last is None else compositing_lanes_record.make_record_colors)(wants_depth)
-            planes = compositing_lanes.color_planes(wants_depth, last is not None)
-            state = lane_scratch("state", TILE_ROWS, planes, device)
-            launch(kernel, lists.tile_count, [*inputs, state], outputs, device=device, slots=True)
+            state = lane_scratch("state", TILE_ROWS, compositing_lanes.color_planes(wants_depth, record), device)
+            kernel = compositing_lanes.make_composite_colors(wants_depth, record)
+            launch(
+                kernel, lists.tile_count, [*inputs, state, *batch_scratch(device)], outputs, device=device, slots=True
+            )
         if image is None:
             image = colors if features is None else colors[..., : features.shape[1]]
     assert image is not None
@@ -190,6 +203,17 @@ def lane_scratch(name: str, rows: int, planes: int, device: torch.device) -> wp.
     shape = (get_threads(), rows, planes, LANE)
     memory = scratch(f"lanes {name}", get_threads() * rows * planes * LANE, torch.float32, device)
     return view(memory.view(shape), Lanes)
+
+
+def batch_scratch(device: torch.device) -> list[wp.array]:
+    """Scratch of the lane schedule for a batch of fragments and the rows they reach."""
+    threads, batch = get_threads(), int(compositing_lanes.BATCH)
+    size = wp.types.type_size_in_bytes(binning.Fragment)
+    memory = scratch("lanes batch", threads * batch * size // 4, torch.int32, device)
+    layout = {"dtype": binning.Fragment, "shape": (threads, batch), "capacity": 4 * len(memory)}
+    fragments: wp.array = wp.array(ptr=memory.data_ptr(), device=wp.device_from_torch(device), **layout)
+    reached = scratch("lanes reached", threads * 2 * batch, torch.int32, device).view(threads, 2, batch)
+    return [fragments, view(reached, wp.int32)]
 
 
 def in_slices(features: Tensor) -> Tensor:
@@ -208,7 +232,7 @@ def _composite_wide(
     settings: RasterSettings,
     features: Tensor,
     transmittance: Tensor,
-    last: Tensor | None,
+    last: Tensor,
     block: bool,
 ) -> Tensor:
     device = lists.order.device
@@ -216,15 +240,13 @@ def _composite_wide(
     image = torch.empty(height, width, features.shape[1], device=device)
     slices = in_slices(features)
     count = slices.shape[1]
-    lead = [view(lists.offsets, wp.int32), lists.fragments]
     tail = [tiles.knobs(settings), width, height]
-    outputs = [view(image, wp.float32), view(transmittance, wp.float32)]
-    if last is not None:
-        outputs.append(view(last, wp.int32))
+    outputs = [view(image, wp.float32), view(transmittance, wp.float32), view(last, wp.int32)]
+    record = len(last) > 0
     if block:
-        make_block = compositing_block.make_composite_features_block
-        kernel = (make_block if last is None else compositing_block.make_record_features_block)()
-        launch_blocks(kernel, [lists.tile_count, count], [*lead, view(slices, Lanes), *tail], outputs, device=device)
+        kernel = compositing_block.make_composite_features_block(record)
+        inputs = [*lists.arrays(), view(slices, Lanes), *tail]
+        launch_blocks(kernel, [lists.tile_count, count], inputs, outputs, device=device)
         return image
     batch = compositing_lanes.BATCH
     weights = lane_scratch("weights", TILE_ROWS, batch, device)
@@ -233,10 +255,9 @@ def _composite_wide(
     first = 0
     while first < count:
         width_of_pass = WIDE_PASS if count - first >= WIDE_PASS else 1
-        make = compositing_lanes.make_composite_features
-        kernel = (make if last is None else compositing_lanes_record.make_record_features)(width_of_pass)
-        state = lane_scratch("state", TILE_ROWS, 1 + LANE * width_of_pass + (last is not None), device)
-        inputs = [*lead, view(slices.unsqueeze(2), Lanes), first, *tail, state, weights, owner_array]
+        kernel = compositing_lanes.make_composite_features(width_of_pass, record)
+        state = lane_scratch("state", TILE_ROWS, 1 + LANE * width_of_pass + record, device)
+        inputs = [*lists.arrays(), view(slices.unsqueeze(2), Lanes), first, *tail, state, weights, owner_array]
         launch(kernel, lists.tile_count, inputs, outputs, device=device, slots=True)
         first += width_of_pass
     return image

@@ -18,18 +18,17 @@ from torch import Tensor
 
 from sgwarp.errors import InputError
 from sgwarp.kernels import binning
-from sgwarp.kernels.gaussian import LEVEL_SLACK, Splat
+from sgwarp.kernels.gaussian import LEVEL_SLACK
 from sgwarp.kernels.projection import TRANSPARENT
 from sgwarp.ops import backward, tiles
-from sgwarp.ops.launch import launch_plain, scratch, view
+from sgwarp.ops.launch import launch, view
 from sgwarp.ops.projection import FACTOR_UNIT
 from sgwarp.ops.rasterize import composite, composite_recorded
 from sgwarp.ops.settings import RasterSettings
 from sgwarp.scene import Camera
 
 TILE = binning.TILE
-FRAGMENT_WORDS = wp.types.type_size_in_bytes(binning.Fragment) // 4
-GAUSSIAN_WORD = list(binning.Fragment.vars).index("gaussian")  # all fields before it are one word long
+DEPTH_WORD = 6  # of the floats of a `Splat`
 HIDDEN_LEVEL = -1.0e4  # log2 of an opacity that reaches no pixel
 
 
@@ -84,8 +83,8 @@ def factors_from_conics(conics: Tensor) -> Tensor:
 
 
 def listed_rows(lists: tiles.TileLists) -> Tensor:
-    """Row of the splat of every fragment, tile by tile, front to back, int32 [n]."""
-    return lists.memory.view(-1, FRAGMENT_WORDS)[:, GAUSSIAN_WORD].clone()
+    """Row of the splat at every place of the lists, tile by tile, front to back, int32 [n]."""
+    return lists.order[lists.listed]
 
 
 def composite_splats(
@@ -137,7 +136,7 @@ class _CompositeSplats(torch.autograd.Function):
         else:
             order = tiles.depth_order(projected)
             colors = _padded(values[order.to(torch.int64)]) if values.shape[1] <= 3 else None
-            lists = tiles.bin_splats(projected, order, colors, camera, settings, keep=keep)
+            lists = tiles.bin_splats(projected, order, colors, camera, places=keep, keep=keep)
         job.lists = lists
         if not keep:
             image, transmittance, depth_sum, _ = composite(lists, camera, settings, values, job.wants_depth)
@@ -145,8 +144,8 @@ class _CompositeSplats(torch.autograd.Function):
         image, transmittance, depth_sum, _, last, hit = composite_recorded(
             lists, camera, settings, values, job.wants_depth
         )
-        kept = (lists.order, lists.entries, lists.offsets, lists.memory, transmittance, last, hit)
-        ctx.save_for_backward(means2d, factors, opacities, features, depths, *kept)
+        recorded = (transmittance, last, hit)
+        ctx.save_for_backward(means2d, factors, opacities, features, depths, *recorded, *vars(lists).values())
         ctx.job = job
         ctx.set_materialize_grads(False)
         return image, transmittance, depth_sum
@@ -157,16 +156,14 @@ class _CompositeSplats(torch.autograd.Function):
         ctx: Any, v_image: Tensor | None, v_transmittance: Tensor | None, v_depth_sum: Tensor | None
     ) -> tuple[Tensor | None, ...]:
         job: SplatJob = ctx.job
-        means2d, factors, opacities, features, depths, order, entries, offsets, memory, *recorded = ctx.saved_tensors
-        fragments = tiles.as_fragments(memory)
-        nothing = order[:0]
+        means2d, factors, opacities, features, depths, *kept = ctx.saved_tensors
         splats = backward.composite_backward(
-            tiles.TileLists(order, entries, offsets, fragments, fragments.size, nothing, nothing, memory),
+            tiles.TileLists(*kept[3:]),
             _frame(job.width, job.height),
             job.settings,
             features.detach().to(torch.float32).contiguous(),
             features.shape[1],
-            tuple(recorded),
+            (kept[0], kept[1], kept[2]),
             backward.ImageGradients(v_image, v_transmittance, v_depth_sum if job.wants_depth else None),
             len(means2d),
             absolute=job.receive_absolute is not None,
@@ -201,7 +198,7 @@ def _frame(width: int, height: int) -> Camera:
 
 
 def _padded(values: Tensor) -> Tensor:
-    """Up to three channels as the three that travel with the fragments."""
+    """Up to three channels as the three that travel with the splats."""
     return torch.nn.functional.pad(values, (0, 3 - values.shape[1])).contiguous()
 
 
@@ -209,48 +206,45 @@ def _as_splats(
     means2d: Tensor, factors: Tensor, opacities: Tensor, depths: Tensor, settings: RasterSettings
 ) -> tiles.Projected:
     """The tensors in the layout of the kernels' `Splat`, with the footprint's extent and whether it can be seen."""
+    device = means2d.device
     with torch.no_grad():
         level = opacities.to(torch.float32).log2()
-        q = level - math.log2(settings.alpha_min) + LEVEL_SLACK
+        reach = level - math.log2(settings.alpha_min) + LEVEL_SLACK
         a, b, c = factors.unbind(1)
-        reach = q.clamp(min=0.0).sqrt()
-        half_width, half_height = reach * (b * b + c * c).sqrt() / (a * c), reach / c
-        columns = [*means2d.unbind(1), a, b, c, level, depths, half_width, half_height]
-        memory = torch.stack([t.to(torch.float32) for t in columns], dim=1)
-        seen = torch.isfinite(memory.sum(1)) & (q >= LEVEL_SLACK) & (a > 0) & (c > 0)
-        hidden = memory.new_tensor([0.0, 0.0, 1.0, 0.0, 1.0, HIDDEN_LEVEL, 0.0, 0.0, 0.0])
-        memory = torch.where(seen[:, None], memory, hidden)
-        kept = scratch("composited splats", memory.numel(), torch.float32, memory.device).view(-1, 9)
-        kept.copy_(memory)
-    layout = {"dtype": Splat, "shape": (len(kept),), "capacity": kept.numel() * 4}
-    splats: wp.array = wp.array(ptr=kept.data_ptr(), device=wp.device_from_torch(kept.device), **layout)
+        radius, steepness = reach.clamp(min=0.0).sqrt(), (b * b + c * c).sqrt()
+        half_width, half_height = radius * steepness / (a * c), radius / c
+        footprint = [half_width, half_height, reach, -b * radius / steepness / c, 1.0 / steepness]
+        columns = [*means2d.unbind(1), a, b, c, level, depths, *footprint]
+        values = torch.stack([t.to(torch.float32) for t in columns], dim=1)
+        seen = torch.isfinite(values.sum(1)) & (reach >= LEVEL_SLACK) & (a > 0) & (c > 0)
+        hidden = values.new_tensor([0.0, 0.0, 1.0, 0.0, 1.0, HIDDEN_LEVEL, 0.0, 0.0, 0.0, HIDDEN_LEVEL, 0.0, 1.0])
+        memory = tiles.splat_memory(len(values), device, "composited splats")
+        rows = memory.view(torch.float32).view(-1, tiles.SPLAT_WORDS)
+        rows[:, : values.shape[1]] = torch.where(seen[:, None], values, hidden)
     status = torch.where(seen, 0, int(TRANSPARENT)).to(torch.uint8)
-    return tiles.Projected(splats, status, memory[:, 6].contiguous())
+    return tiles.Projected(tiles.as_splats(memory), status, rows[:, DEPTH_WORD].contiguous())
 
 
 def _follow(given: ListedSplats, projected: tiles.Projected, values: Tensor, camera: Camera) -> tiles.TileLists:
-    """Fragments of tile lists that somebody else made, in their order."""
+    """Tile lists that somebody else made; the splats keep the order they were given in."""
     device, count, n = values.device, len(projected.status), len(given.listed)
     grid = -(-camera.width // TILE) * -(-camera.height // TILE)
     if len(given.offsets) != grid + 1:
         size = f"{camera.width} x {camera.height}"
         got = len(given.offsets) - 1
         raise InputError(f"tile lists: expected {grid} tiles of 16 x 16 for an image of {size}, got {got}")
-    listed = given.listed.to(torch.int64)
-    sorter = listed.argsort(stable=True)
-    entry_of_place = torch.empty(n, dtype=torch.int32, device=device)
-    entry_of_place[sorter] = torch.arange(n, dtype=torch.int32, device=device)
-    entries = torch.zeros(count + 1, dtype=torch.int32, device=device)
-    entries[1:] = torch.bincount(listed, minlength=count).cumsum(0)
-    offsets = given.offsets.to(torch.int32).contiguous()
-    owners = torch.repeat_interleave(
-        torch.arange(grid, dtype=torch.int32, device=device), offsets.diff(), output_size=n
-    )
     order = torch.arange(count, dtype=torch.int32, device=device)
     colors = _padded(values) if values.shape[1] <= 3 else torch.empty(0, 3, device=device)
-    memory = tiles.fragment_memory(n, device, keep=True)
-    fragments, places = tiles.as_fragments(memory), torch.empty(n, dtype=torch.int32, device=device)
-    inputs = [view(t, wp.int32) for t in (owners, entry_of_place, listed[sorter].to(torch.int32), order)]
-    inputs += [projected.splats, view(colors, wp.vec3), camera.width]
-    launch_plain(binning.pack_fragments, n, inputs, [fragments, view(places, wp.int32)], device=device)
-    return tiles.TileLists(order, entries, offsets, fragments, n, places, owners[sorter], memory)
+    memory = tiles.splat_memory(count, device, None)
+    ordered = tiles.as_splats(memory)
+    inputs = [view(order, wp.int32), projected.splats, view(colors, wp.vec3)]
+    launch(binning.order_splats, count, inputs, [ordered], device=device)
+    listed = given.listed.to(torch.int32).contiguous()
+    places = listed.argsort(stable=True)
+    entries = torch.zeros(count + 1, dtype=torch.int32, device=device)
+    entries[1:] = torch.bincount(listed, minlength=count).cumsum(0)
+    owners = torch.repeat_interleave(
+        torch.arange(grid, dtype=torch.int32, device=device), given.offsets.diff(), output_size=n
+    )
+    offsets = given.offsets.to(torch.int32).contiguous()
+    return tiles.TileLists(order, memory, offsets, listed, entries, places.to(torch.int32), owners[places])

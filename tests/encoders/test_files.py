@@ -10,7 +10,7 @@ import pytest
 import torch
 from safetensors.numpy import save_file
 
-from sgwarp.encoders.files import FileMaps, MissingMap, open_files
+from sgwarp.encoders.files import FileMaps, MissingMap
 from sgwarp.encoders.registry import make_encoder
 from sgwarp.errors import InputError
 from sgwarp.scene import Camera, View
@@ -124,7 +124,7 @@ def test_ambiguous_layout_must_be_named(tmp_path):
     with pytest.raises(InputError, match=r"a\.npy.*may be chw or hwc.*layout="):
         FileMaps(tmp_path, [square])
     assert FileMaps(tmp_path, [square], layout="chw").encode(square).channels == 16
-    assert open_files(f"{tmp_path}?layout=hwc", [square]).encode(square).channels == 16
+    assert make_encoder(f"files:{tmp_path}?layout=hwc", [square]).encode(square).channels == 16
 
 
 @pytest.mark.parametrize(("shape", "layout"), [((5, 16, 12), None), ((12, 16, 5), "chw"), ((5, 12, 16), "hwc")])
@@ -165,7 +165,7 @@ def test_langsplat_pair(pair):
     assert source.space == "files:8"
     assert found.ids.tolist() == ids.tolist()
     assert found.vectors.tolist() == vectors.astype(np.float32).tolist()
-    chosen = open_files(f"{folder}?levels=3,1", VIEWS).encode(view())
+    chosen = make_encoder(f"files:{folder}?levels=3,1", VIEWS).encode(view())
     assert chosen.ids.tolist() == ids[[3, 1]].tolist()
 
 
@@ -272,11 +272,11 @@ def test_label_that_came_later(labels):
     ("name", "message"),
     [
         ("files:nowhere", "nowhere: no such folder"),
-        ("files:", "no folder given"),
+        ("files:", "write files:DIR"),
         ("files:.?layout=abc", "layout is chw or hwc"),
         ("files:.?levels=s", "levels are numbers"),
-        ("files:.?colour=1", "unknown option 'colour'"),
-        ("files:.?layout", "expected options as key=value"),
+        ("files:.?colour=1", "files has no option 'colour'"),
+        ("files:.?layout", "option layout has no value; write it as key=value"),
     ],
 )
 def test_bad_names(name, message):

@@ -1,4 +1,4 @@
-"""Regions, their squares and their means, against slow loops."""
+"""Proposals, the boxes and squares of masks, and what is read inside them, against slow loops."""
 
 import cv2
 import numpy as np
@@ -6,15 +6,11 @@ import pytest
 import torch
 
 from sgwarp.encoders.imagenet_classifier import STRIDE, LogitMap
-from sgwarp.encoders.regions import (
-    bounding_squares,
-    cut_squares,
-    propose_regions,
-    region_areas,
-    region_means,
-    segment_regions,
-)
+from sgwarp.encoders.painting import spread
+from sgwarp.encoders.proposals import Proposals, propose_regions, segment_regions
+from sgwarp.encoders.regions import box_squares, cut_squares, mask_boxes
 from sgwarp.errors import InputError
+from sgwarp.scene import Camera, View
 
 
 @pytest.fixture
@@ -41,11 +37,16 @@ def test_segmentation_finds_plain_shapes():
         assert ((found == number) & same).sum() / ((found == number) | same).sum() > 0.8
 
 
-def test_areas_and_squares(regions):
-    squares = bounding_squares(regions, 1.5)
+def as_masks(regions) -> torch.Tensor:
+    return torch.from_numpy(regions) == torch.arange(regions.max() + 1)[:, None, None]
+
+
+def test_boxes_and_squares(regions):
+    boxes = mask_boxes(as_masks(regions))
+    squares = box_squares(boxes, 1.5)
     for number in range(regions.max() + 1):
         y, x = np.nonzero(regions == number)
-        assert region_areas(regions)[number] == len(y)
+        assert boxes[number].tolist() == [x.min(), y.min(), x.max() + 1, y.max() + 1]
         side = 1.5 * max(y.max() - y.min() + 1, x.max() - x.min() + 1)
         middle = (x.min() + x.max() + 1) / 2, (y.min() + y.max() + 1) / 2
         np.testing.assert_allclose(squares[number], [middle[0] - side / 2, middle[1] - side / 2, side])
@@ -88,7 +89,9 @@ def test_region_means_equal_a_loop_over_pixels(regions, locations):
     values = torch.randn(*locations, 7, dtype=torch.float64, generator=torch.Generator().manual_seed(0))
     found = LogitMap(values, (locations[0] * STRIDE, locations[1] * STRIDE), 3.0)
     rows, columns = found.interpolation(*regions.shape)
-    means = region_means(regions, rows, columns, values.float())
+    masks = as_masks(regions)
+    sums = spread(masks, rows, columns).flatten(1) @ values.float().flatten(0, 1)
+    means = sums / masks.flatten(1).sum(dim=1)[:, None]
     for number in range(regions.max() + 1):
         wanted = torch.zeros(7, dtype=torch.float64)
         pixels = np.argwhere(regions == number)
@@ -127,3 +130,39 @@ def test_every_kind_of_proposal_separates_a_square_from_its_ground(method, scale
 def test_unknown_proposals_are_refused():
     with pytest.raises(InputError, match="graph, slic, seeds, selective"):
         propose_regions(np.zeros((8, 8, 3), np.uint8), "sam", 1.0)
+
+
+def plain_view(height: int, width: int) -> View:
+    K = torch.tensor([[50.0, 0, width / 2], [0, 50.0, height / 2], [0, 0, 1]])
+    return View("a", Camera(K, torch.eye(4), width, height))
+
+
+def test_scales_become_ranks():
+    noise = np.random.default_rng(0).normal(128, 400, (60, 80, 3))
+    image = torch.from_numpy(cv2.GaussianBlur(noise, (0, 0), 4).clip(0, 255)).float() / 255
+    found = Proposals(scales=(900.0, 30.0, 200.0), smallest=10, side=80).everything(plain_view(60, 80), image)
+    counts = [int((found.ranks == rank).sum()) for rank in range(3)]
+    assert counts[0] > counts[1] > counts[2] > 0
+    for rank in range(3):  # each scale is a partition
+        assert (found.masks[found.ranks == rank].sum(dim=0) == 1).all()
+    assert found.at_level("default").tolist() == list(range(len(found)))
+    assert found.at_level("l").tolist() == (found.ranks == 2).nonzero().flatten().tolist()
+    with pytest.raises(InputError, match="level 'xl' is not one of default, s, m, l"):
+        found.at_level("xl")
+
+
+def test_large_images_are_segmented_small():
+    found = Proposals(side=40).everything(plain_view(60, 80), torch.rand(60, 80, 3))
+    assert found.masks.shape[1:] == (30, 40)
+    assert (found.masks.sum(dim=0) == 1).all()
+
+
+def test_proposals_have_no_boxes():
+    with pytest.raises(InputError, match="cannot be asked for the mask of a box; use sam:PATH"):
+        Proposals().in_boxes(torch.zeros(8, 8, 3), torch.zeros(1, 4))
+
+
+@pytest.mark.parametrize("settings", [{"scales": (0.0,)}, {"side": 2}, {"smallest": 0}, {"method": "sam"}])
+def test_bad_proposals(settings):
+    with pytest.raises(InputError, match="proposals"):
+        Proposals(**settings)

@@ -29,14 +29,12 @@ def cuda_kernels() -> list[wp.Kernel]:
                 k for k in vars(module).values() if isinstance(k, wp.Kernel) and k.module.name == module.__name__
             ]
     for flag in (False, True):
-        kernels.append(compositing_block.make_composite_colors_block(flag))
-        kernels.append(compositing_block.make_record_colors_block(flag))
+        kernels += [compositing_block.make_composite_colors_block(depth, flag) for depth in (False, True)]
+        kernels.append(compositing_block.make_composite_features_block(flag))
         kernels.append(lifting_block.make_lift_dense_block(flag))
         kernels.append(lifting_block.make_lift_ids_block(flag))
         kernels.append(pixel_lists.make_list_contributors(flag))
         kernels.append(voxels.make_list_pairs(flag))
-    kernels.append(compositing_block.make_composite_features_block())
-    kernels.append(compositing_block.make_record_features_block())
     for wide, ordered in itertools.product((False, True), repeat=2):
         # The options go together here: each adds its own lines to a kernel, and together they need most registers.
         kernels.append(compositing_block_backward.make_composite_backward_block(wide, ordered, ordered, ordered))
@@ -45,13 +43,12 @@ def cuda_kernels() -> list[wp.Kernel]:
 
 def test_the_list_of_kernels_is_complete():
     names = {kernel.key.split("__locals__")[-1] for kernel in cuda_kernels()}
-    assert {"project_gaussians", "evaluate_harmonics", "pack_fragments", "sum_rows", "find_center_pixels"} <= names
+    assert {"project_gaussians", "evaluate_harmonics", "list_sorted", "sum_rows", "find_center_pixels"} <= names
+    assert "rank_contributors_block" in names
     factories = {
         "list_contributors",
         "composite_colors_block",
         "composite_features_block",
-        "record_colors_block",
-        "record_features_block",
         "composite_backward_block",
         "lift_dense_block",
         "lift_ids_block",

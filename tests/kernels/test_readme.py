@@ -51,7 +51,7 @@ ROWS = rows_of_the_table()
 
 def test_the_sources_were_read():
     assert {"project_gaussians", "composite_colors", "lift_dense_block", "sum_rows"} <= set(SOURCES)
-    assert SOURCES["composite_colors"][1] == "make_composite_colors(depth)"
+    assert SOURCES["composite_colors"][1] == "make_composite_colors(depth, record)"
 
 
 def test_the_table_names_every_kernel_and_no_other():

@@ -9,9 +9,10 @@ from torch import Tensor
 
 from sgwarp.errors import InputError
 from sgwarp.ops import launch, reference
-from sgwarp.ops.differentiable import rasterize_differentiable
+from sgwarp.ops.differentiable import rasterize as rasterize_differentiable
 from sgwarp.ops.rasterize import Rendering, rasterize
 from sgwarp.ops.settings import RasterSettings
+from sgwarp.report.extremes import EXTREMES
 from sgwarp.scene import Camera, Gaussians
 
 # Pixels nearer than this to a threshold, or to a change of the depth order, may flip in float32; no loss looks at them.
@@ -180,30 +181,39 @@ def test_every_setting_matches_the_oracle(make_scene, settings):
     assert_rows_close(got, expected)
 
 
-@pytest.mark.parametrize("name", ["random_cloud", "needles", "sh3", "off_centre"])
-def test_gradients_match_central_differences_of_the_oracle(make_scene, name):
-    """Along random directions of all parameters at once: no autograd on the other side."""
-    _, gaussians, camera = make_scene(name)
-    settings = SETTINGS
-    got, _, loss = both(gaussians, camera)
-    rng = torch.Generator().manual_seed(0)
-    point = Leaves.of(gaussians, camera, None, torch.rand(3, generator=rng), torch.float64).tensors
-    step = 1e-7
-    for parameter in ("means", "quats", "scales", "opacities", "sh", "viewmat", "background"):
-        unit = torch.randn(point[parameter].shape, generator=rng, dtype=torch.float64)
-        unit *= got[parameter].double().abs().mean() / got[parameter].double().abs().clamp(min=1e-9)
-        unit = unit.clamp(-1, 1)
-        if parameter == "viewmat":
-            unit[3] = 0.0
-        values = []
-        with torch.no_grad():
-            for sign in (-1, 1):
-                moved = {**point, parameter: point[parameter] + sign * step * unit}
-                values.append(loss(oracle(Leaves(moved), camera, settings)))
-        numeric = (values[1] - values[0]) / (2 * step)
-        terms = got[parameter].double() * unit
-        # What float32 rounding is relative to is the sum of magnitudes, not what is left of it.
-        assert abs(terms.sum() - numeric) <= 1e-3 * abs(numeric) + 1e-4 * terms.norm(), parameter
+def compare_with_differences(compare, gaussians: Gaussians, camera: Camera, settings: RasterSettings, groups: int):
+    """No autograd on the other side: the float64 oracle is only evaluated."""
+    got, _, loss = both(gaussians, camera, settings)
+    background = torch.rand(3, generator=torch.Generator().manual_seed(0))
+    point = Leaves.of(gaussians, camera, None, background, torch.float64).tensors
+    point = {name: tensor.detach() for name, tensor in point.items()}
+    depths = point["means"] @ camera.world_to_camera[2, :3] + camera.world_to_camera[2, 3]
+    if len(depths.unique()) < len(depths):
+        del got["means"], got["viewmat"]  # what breaks a tie in depth makes the image jump
+    compare(lambda moved: loss(oracle(Leaves(moved), camera, settings)), point, got, groups)
+
+
+@pytest.mark.parametrize("antialiased", [False, True])
+def test_gradients_match_central_differences_of_the_oracle(scene, assert_central_differences, antialiased):
+    _, gaussians, camera = scene
+    compare_with_differences(assert_central_differences, gaussians, camera, RasterSettings(antialiased=antialiased), 2)
+
+
+SMALL_EXTREMES = [e for e in EXTREMES.values() if 0 < len(e.build()[0]) < 1000]  # the oracle runs fourteen times
+TOO_THIN = {"needles", "scales 1e-7", "focal 1e-2"}  # antialiasing leaves nothing of them
+
+
+@pytest.mark.parametrize("antialiased", [False, True])
+@pytest.mark.parametrize("extreme", SMALL_EXTREMES, ids=lambda extreme: extreme.name)
+def test_gradients_match_central_differences_at_the_extremes(extreme, assert_central_differences, antialiased):
+    """Of the rows that are finite; the others' gradients are exactly zero, which is tested below."""
+    gaussians, camera = extreme.build()
+    gaussians, settings = gaussians.subset(gaussians.finite), RasterSettings(antialiased=antialiased)
+    if antialiased and extreme.name in TOO_THIN:
+        got, expected, _ = both(gaussians, camera, settings)
+        assert not any((gradients[name] != 0).any() for gradients in (got, expected) for name in GEOMETRY)
+        return
+    compare_with_differences(assert_central_differences, gaussians, camera, settings, 1)
 
 
 @pytest.mark.parametrize("deterministic", [True, False])
@@ -221,7 +231,8 @@ def test_block_schedule_equals_lane_schedule(scene, deterministic):
             loss = Loss.random(raster)
             loss(ours(leaves, camera, settings, absgrad=True, **options)).backward()
             results.append({**leaves.gradients(), "absgrad": leaves.tensors["means2d"].absgrad})
-        assert_rows_close(results[1], results[0], tolerance=5e-4)
+        # Both may differ from the oracle by 1e-3; where a sum nearly cancels, each rounds its own way.
+        assert_rows_close(results[1], results[0], tolerance=2e-3)
 
 
 def test_same_bits_for_any_number_of_threads(make_scene, monkeypatch):

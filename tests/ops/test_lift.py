@@ -163,7 +163,7 @@ def test_block_schedule_equals_lane_schedule(scene, ordered):
     _, gaussians, camera = scene
     projected = tiles.project(gaussians, camera, SETTINGS)
     order = tiles.depth_order(projected)
-    lists = tiles.bin_splats(projected, order, None, camera, SETTINGS, places=True)
+    lists = tiles.bin_splats(projected, order, None, camera, places=True, tiles=True)
     ids = random_ids(*camera.size, 20)
     maps = [
         FeatureMap(space="t", dense=random_map(camera, 20), valid=ids[0] > 5),

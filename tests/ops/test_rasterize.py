@@ -7,8 +7,6 @@ import torch
 import warp as wp
 
 from sgwarp.errors import InputError
-from sgwarp.kernels import binning
-from sgwarp.kernels.gaussian import Splat
 from sgwarp.ops import launch, reference, tiles
 from sgwarp.ops.rasterize import composite, rasterize
 from sgwarp.ops.settings import RasterSettings
@@ -25,8 +23,8 @@ def lists_of(
     settings = RasterSettings()
     projected = tiles.project(gaussians, camera, settings)
     order = tiles.depth_order(projected)
-    colors = tiles.shade(gaussians, camera, order, settings)
-    return projected, order, colors, tiles.bin_splats(projected, order, colors, camera, settings, places=True)
+    colors = tiles.shade(gaussians, camera, order, gaussians.sh_degree)
+    return projected, order, colors, tiles.bin_splats(projected, order, colors, camera, places=True, tiles=True)
 
 
 def test_colors_and_alpha_match_the_oracle(scene):
@@ -112,26 +110,15 @@ def test_block_schedule_equals_lane_schedule(scene):
 
 
 def test_sorted_lists_equal_counted_lists(scene):
-    """The CUDA way of binning (emit, sort, pack) gives the CPU's lists."""
+    """The CUDA way of binning (emit, sort, list) gives the CPU's lists."""
     _, gaussians, camera = scene
     projected, order, colors, counted = lists_of(gaussians, camera)
-    fragments = counted.fragments.numpy().copy()
-    kept = [t.clone() for t in (counted.offsets, counted.places, counted.tiles, counted.entries)]
-    ordered = launch.scratch_structs("test", len(order), Splat, order.device)
-    launch.launch(
-        binning.gather_splats,
-        len(order),
-        [launch.view(order, wp.int32), projected.splats],
-        [ordered],
-        device=order.device,
-    )
-    grid = (counted.tile_count, camera.width, camera.height)
+    kept = [t.clone() for t in vars(counted).values()]
+    memory = torch.zeros_like(counted.memory)
     packed = launch.view(colors, wp.vec3)
-    by_sort = tiles.bin_by_sorting(ordered, projected.status, order, packed, grid, math.log2(1 / 255))
-    for name in fragments.dtype.names:
-        assert (fragments[name] == by_sort.fragments.numpy()[name]).all(), name
-    for a, b in zip(kept, (by_sort.offsets, by_sort.places, by_sort.tiles, by_sort.entries), strict=True):
-        assert torch.equal(a, b)
+    by_sort = tiles.bin_by_sorting(projected, order, packed, camera, memory, places=True, tiles=True, keep=True)
+    for name, want, got in zip(vars(counted), kept, vars(by_sort).values(), strict=True):
+        assert torch.equal(want, got), name
 
 
 def least_on_tile(mean: torch.Tensor, conic: torch.Tensor, tile: int, camera: Camera) -> float:
@@ -156,7 +143,7 @@ def test_tile_lists_hold_exactly_what_reaches_a_tile(make_scene):
     for name in ("needles", "odd_size", "off_centre"):
         _, gaussians, camera = make_scene(name)
         *_, lists = lists_of(gaussians, camera)
-        fragments = lists.fragments.numpy()
+        splats, ranks = lists.splats.numpy(), lists.listed.numpy()
         p = reference.project_scene(gaussians, camera)
         y, x = torch.meshgrid(torch.arange(camera.height), torch.arange(camera.width), indexing="ij")
         at = torch.stack([x, y], -1).reshape(-1, 1, 2).double() + 0.5
@@ -166,7 +153,7 @@ def test_tile_lists_hold_exactly_what_reaches_a_tile(make_scene):
         alpha = p.opacity * power.exp()
         tile = (y // 16 * -(-camera.width // 16) + x // 16).reshape(-1)
         for t in range(lists.tile_count):
-            listed = fragments[lists.offsets[t] : lists.offsets[t + 1]]
+            listed = splats[ranks[lists.offsets[t] : lists.offsets[t + 1]]]
             depths = listed["depth"]
             assert (depths[1:] >= depths[:-1]).all()
             reached = set(p.index[(alpha[tile == t] > (1 / 255) * (1 + 1e-4)).any(0)].tolist())

@@ -215,7 +215,7 @@ def test_segment_and_query_take_predicted_semantics(
     from sgwarp.encoders import registry
     from sgwarp.io.images import read_ids
 
-    monkeypatch.setattr(registry, "text_encoder_for", lambda space: toy_text)
+    monkeypatch.setattr(registry, "text_encoder_for", lambda space, *rest: toy_text)
     wall = stage.classes == 1
     lifted = projection(stage_files, stage, ~wall, tmp_path / "2d.safetensors")
     predicted = projection(stage_files, stage, torch.ones_like(wall), tmp_path / "3d.safetensors")

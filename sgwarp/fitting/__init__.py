@@ -1,0 +1,1 @@
+"""Parts of `sgwarp.fit`: photographs, starting points, the model, strategies, checkpoints, pictures."""

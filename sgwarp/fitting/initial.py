@@ -1,0 +1,122 @@
+"""What a fit starts from: Gaussians at points of structure from motion, or at random in what the cameras see."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from sgwarp.errors import InputError
+from sgwarp.fitting.photographs import Photograph, camera_extent
+from sgwarp.fitting.seeds import generator
+from sgwarp.fitting.settings import FitSettings
+from sgwarp.from_depth import SH_C0
+from sgwarp.io.images import read_ids
+from sgwarp.ops.neighbors import mean_squared_neighbor_distance
+from sgwarp.scene import Gaussians, View
+
+OPACITY = {"default": 0.1, "mcmc": 0.5}  # of the reference implementations
+SIZE = 1.0  # in root mean square distances to the three nearest others
+LEAST_DISTANCE = 1e-4  # [extent of the cameras], for points in the same place
+LEAST_POINTS = 4  # that three neighbours need
+RANDOM_COUNT = 50_000
+NEAREST, FARTHEST = 0.2, 4.0  # of random points [extent of the cameras]
+MILLIMETRE = 1e-3  # [m], the unit of depth images
+
+
+def gaussians_from_points(
+    positions: Any, colours: Any, settings: FitSettings, extent: float, device: str | torch.device = "cpu"
+) -> Gaussians:
+    """A round Gaussian of SH degree 0 at every point, as large as the distance to its neighbours.
+
+    Args:
+        positions: [m], [N, 3]. Of more points than `settings.cap`, so many are drawn at random.
+        colours: In [0, 1], [N, 3].
+        extent: Of the cameras [m].
+
+    Raises:
+        InputError: Fewer than 4 points, or one that is not finite.
+    """
+    positions = torch.as_tensor(np.asarray(positions), dtype=torch.float64)
+    colours = torch.as_tensor(np.asarray(colours), dtype=torch.float32)
+    if positions.ndim != 2 or positions.shape[1] != 3 or colours.shape != positions.shape:
+        raise InputError(f"points: expected [N, 3] twice, got {list(positions.shape)} and {list(colours.shape)}")
+    if len(positions) < LEAST_POINTS:
+        raise InputError(f"points: a scene starts from at least {LEAST_POINTS}, got {len(positions)}; or from none")
+    if len(positions) > settings.cap:
+        drawn = torch.randperm(len(positions), generator=generator(settings.seed, 0, "points"))[: settings.cap]
+        kept = drawn.sort().values
+        positions, colours = positions[kept], colours[kept]
+    distance = mean_squared_neighbor_distance(positions).sqrt().clamp(min=LEAST_DISTANCE * extent)
+    count = len(positions)
+    gaussians = Gaussians(
+        means=positions.to(torch.float32),
+        quats=torch.tensor([1.0, 0.0, 0.0, 0.0]).expand(count, 4),
+        scales=(SIZE * distance)[:, None].expand(count, 3),
+        opacities=torch.full((count,), OPACITY[settings.strategy]),
+        sh=((colours - 0.5) / SH_C0)[:, None, :],
+    )
+    return gaussians.to(device)
+
+
+def random_points(
+    photographs: Sequence[Photograph], views: Sequence[View], settings: FitSettings
+) -> tuple[Tensor, Tensor]:
+    """Points at random pixels and distances in front of the cameras, with the colours of these pixels.
+
+    Distances are spread evenly by their logarithm.
+
+    Returns:
+        Positions [m], float64 [N, 3], and colours in [0, 1], float32 [N, 3].
+    """
+    extent = camera_extent(views)
+    count = min(settings.cap, RANDOM_COUNT)
+    random = generator(settings.seed, 0, "random points")
+    positions, colours = [], []
+    for index, photograph in enumerate(photographs):
+        share = (count + len(photographs) - 1 - index) // len(photographs)  # they add up to `count`
+        camera = photograph.camera
+        u, v, w = torch.rand(3, share, generator=random, dtype=torch.float64)
+        x, y = u * camera.width, v * camera.height
+        depth = extent * NEAREST * (FARTHEST / NEAREST) ** w
+        rays = torch.stack([x, y, torch.ones_like(x)], dim=1) @ torch.linalg.inv(camera.K).T
+        positions.append((rays * depth[:, None]) @ camera.world_to_camera[:3, :3] + camera.position)
+        colours.append(photograph.image().cpu()[y.long(), x.long()])
+    return torch.cat(positions), torch.cat(colours)
+
+
+def adapted(gaussians: Gaussians, settings: FitSettings) -> Gaussians:
+    """A scene that exists already, as a fit can start from it.
+
+    Raises:
+        InputError: It is empty or larger than the cap, or holds NaN or infinity.
+    """
+    if not len(gaussians):
+        raise InputError("the scene to start from holds no Gaussians")
+    if len(gaussians) > settings.cap:
+        raise InputError(f"the scene to start from has {len(gaussians)} Gaussians, more than the cap {settings.cap}")
+    if gaussians.non_finite:
+        raise InputError(f"{gaussians.non_finite} Gaussians to start from hold NaN or infinity; remove them first")
+    return gaussians
+
+
+def depth_from_folder(folder: Path) -> Callable[[View], Any]:
+    """Depth of a view [m], [H, W], 0 where there is none: {stem}.npy in metres or {stem}.png in millimetres.
+
+    What is returned raises InputError if there is neither, or it cannot be read.
+    """
+
+    def depth(view: View) -> Any:
+        numbers = folder / f"{view.stem}.npy"
+        if not numbers.is_file():
+            return read_ids(folder / f"{view.stem}.png").astype(np.float32) * np.float32(MILLIMETRE)
+        try:
+            return np.load(numbers, allow_pickle=False)
+        except (ValueError, EOFError):
+            raise InputError(f"{numbers}: is not an array that NumPy can read; write it again") from None
+
+    return depth

@@ -1,0 +1,33 @@
+"""How good a scene is on photographs."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+from torch import Tensor
+
+
+@dataclass(frozen=True)
+class Measurement:
+    """Where a run stood.
+
+    Attributes:
+        step: Steps taken.
+        seconds: Spent on them, without reading and measuring.
+        psnr: Mean over the held-out views [dB], NaN without any.
+        loss: Running mean of the loss.
+        count: Gaussians.
+    """
+
+    step: int
+    seconds: float
+    psnr: float
+    loss: float
+    count: int
+
+
+def psnr(image: Tensor, truth: Tensor) -> float:
+    """Peak signal-to-noise ratio of an image, clipped to [0, 1], against the truth [dB]."""
+    error = float((image.clamp(0.0, 1.0) - truth).square().mean())
+    return math.inf if error == 0.0 else -10.0 * math.log10(error)

@@ -1,0 +1,104 @@
+"""Coloured points of a scene, as structure from motion leaves them: COLMAP models and PLY files."""
+
+from __future__ import annotations
+
+import json
+import os
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from sgwarp.errors import InputError
+from sgwarp.io.colmap_model import find_model, read_points
+from sgwarp.io.files import read_bytes
+from sgwarp.io.ply import POSITION, columns, read_elements
+
+PLY_NAMES = ("points3D.ply", "sparse_pc.ply", "point_cloud.ply")  # beside a transforms.json that names none
+PLY_KEY = "ply_file_path"  # of nerfstudio's transforms.json
+RGB = ("red", "green", "blue")
+GREY = 0.5
+
+Points = tuple[NDArray[np.float64], NDArray[np.float32]]  # positions [N, 3] [m], colours [N, 3] in [0, 1]
+
+
+def load_points(path: str | os.PathLike[str]) -> Points:
+    """Read the points of a data set, or of one file.
+
+    Args:
+        path: What `load_views` takes: a folder with transforms.json (whose `ply_file_path` names the points, else
+            points3D.ply, sparse_pc.ply or point_cloud.ply beside it) or with a COLMAP model; or a .ply, or a COLMAP
+            points3D.bin or .txt.
+
+    Returns:
+        Positions, float64 [N, 3], and colours in [0, 1], float32 [N, 3]. Points that are not finite are left out.
+
+    Raises:
+        InputError: There is no such file, or it holds no points.
+    """
+    if not Path(path).exists():
+        raise InputError(f"{path}: no such file or folder; check the path")
+    source = find_points(path)
+    if source is None:
+        raise InputError(
+            f"{path}: holds no points; looked for '{PLY_KEY}' in transforms.json, {', '.join(PLY_NAMES)} and the "
+            "points3D of a COLMAP model"
+        )
+    if source.suffix.lower() == ".ply":
+        positions, colours = _read_ply(source)
+    else:
+        positions, bytes_ = read_points(source)
+        colours = bytes_.astype(np.float32) / np.float32(255)
+    finite = np.isfinite(positions).all(axis=1) & np.isfinite(colours).all(axis=1)
+    if not finite.any():
+        raise InputError(f"{source}: holds no finite points; export them again, or start without any")
+    return positions[finite], colours[finite].clip(0, 1)
+
+
+def find_points(path: str | os.PathLike[str]) -> Path | None:
+    """The file of points that belongs to a data set, or None."""
+    path = Path(path)
+    if path.is_file() and path.suffix.lower() != ".json":
+        return path
+    folder = path if path.is_dir() else path.parent
+    transforms = path if path.is_file() else folder / "transforms.json"
+    if transforms.is_file():
+        named = _named_in(transforms)
+        if named is not None:
+            return named
+        beside = [folder / name for name in PLY_NAMES]
+        if found := next((file for file in beside if file.is_file()), None):
+            return found
+    model = find_model(folder)
+    if model is None:
+        return None
+    return next((model / name for name in ("points3D.bin", "points3D.txt") if (model / name).is_file()), None)
+
+
+def _named_in(transforms: Path) -> Path | None:
+    try:
+        meta: Any = json.loads(read_bytes(transforms))
+    except (ValueError, RecursionError):
+        return None  # whoever reads the cameras says what is wrong with the file
+    name = meta.get(PLY_KEY) if isinstance(meta, dict) else None
+    if name is None:
+        return None
+    if not isinstance(name, str):
+        raise InputError(f"{transforms}: '{PLY_KEY}' must be the name of a file, got {name!r}")
+    named = transforms.parent / name.replace("\\", "/")
+    if not named.is_file():
+        raise InputError(f"{transforms}: its '{PLY_KEY}' {name!r} does not exist; copy the file, or remove the entry")
+    return named
+
+
+def _read_ply(path: Path) -> Points:
+    elements = read_elements(path)
+    vertex = elements.get("vertex")
+    if vertex is None or not set(POSITION) <= set(vertex.dtype.names or ()):
+        raise InputError(f"{path}: has no element 'vertex' with x, y, z; expected points")
+    positions = columns(path, vertex, POSITION).astype(np.float64)
+    if not set(RGB) <= set(vertex.dtype.names or ()):
+        return positions, np.full(positions.shape, GREY, np.float32)
+    colours = columns(path, vertex, RGB)
+    return positions, colours / np.float32(255) if vertex.dtype["red"].kind in "iu" else colours

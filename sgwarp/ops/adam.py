@@ -1,0 +1,121 @@
+"""The optimiser of a scene's parameters, row by row, and the random walk of its faint Gaussians."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import torch
+import warp as wp
+from torch import Tensor
+
+from sgwarp.kernels import optimizing as kernels
+from sgwarp.ops.launch import launch, view
+
+FORMS = {"plain": kernels.PLAIN, "logarithm": kernels.LOGARITHM, "logit": kernels.LOGIT}
+
+
+@dataclass(eq=False)
+class Group:
+    """One kind of parameter of all Gaussians.
+
+    Attributes:
+        parameters: What is optimised, float32 [N, ...].
+        values: What is rendered, float32 [N, ...]; the parameters themselves if `form` is "plain".
+        first, second: Running means of the gradient and of its square, float32 [N, ...].
+        form: What the parameters are of the values: "plain", "logarithm" or "logit".
+    """
+
+    parameters: Tensor
+    values: Tensor
+    first: Tensor
+    second: Tensor
+    form: str
+
+    @classmethod
+    def starting(cls, parameters: Tensor, form: str = "plain") -> Group:
+        """Parameters that have taken no step."""
+        zeros = torch.zeros_like(parameters)
+        return cls(parameters, values_of(parameters, form), zeros, zeros.clone(), form)
+
+
+def values_of(parameters: Tensor, form: str) -> Tensor:
+    """What is rendered for these parameters."""
+    if form == "plain":
+        return parameters
+    return parameters.exp() if form == "logarithm" else parameters.sigmoid()
+
+
+def count_steps(v_opacities: Tensor, v_sh: Tensor, steps: Tensor, *, sparse: bool) -> Tensor:
+    """Count this step for those that take it.
+
+    Args:
+        v_opacities, v_sh: Gradients, float32 [N] and [N, K, 3].
+        steps: How many each Gaussian has taken, int32 [N]; added to.
+        sparse: Only Gaussians that the view has seen take the step, else all.
+
+    Returns:
+        1 for each Gaussian that takes this step, uint8 [N].
+    """
+    taken = torch.empty(len(steps), dtype=torch.uint8, device=steps.device)
+    inputs = [view(v_opacities, wp.float32), view(v_sh, wp.vec3), int(not sparse)]
+    outputs = [view(steps, wp.int32), view(taken, wp.uint8)]
+    launch(kernels.count_steps, len(steps), inputs, outputs, device=steps.device)
+    return taken
+
+
+def update(
+    group: Group,
+    gradient: Tensor,
+    taken: Tensor,
+    steps: Tensor,
+    rate: float,
+    *,
+    leading: int | None = None,
+    rate_of_rest: float = 0.0,
+    pull: float = 0.0,
+) -> None:
+    """One step of Adam (betas 0.9 and 0.999, epsilon 1e-15) for the rows that take it.
+
+    Args:
+        group: Parameters, values and moments, changed in place.
+        gradient: Of the values, float32 [N, ...].
+        taken, steps: Of `count_steps`.
+        rate: Learning rate of the first `leading` columns, by default all.
+        rate_of_rest: Of the others.
+        pull: Added to the gradient.
+    """
+    count = len(steps)
+    if not count:
+        return
+    columns = group.parameters[0].numel()
+    rows = [t.view(count, columns) for t in (group.parameters, group.first, group.second, group.values)]
+    inputs = [
+        view(taken, wp.uint8),
+        view(steps, wp.int32),
+        view(gradient.contiguous().view(count, columns), wp.float32),
+        int(FORMS[group.form]),
+        rate,
+        columns if leading is None else leading,
+        rate_of_rest,
+        pull,
+    ]
+    launch(kernels.update_rows, count, inputs, [view(t, wp.float32) for t in rows], device=steps.device)
+
+
+def note_gradients(v_means2d: Tensor, taken: Tensor, width: int, height: int, sums: Tensor, views: Tensor) -> None:
+    """Add the length of each seen centre's gradient, in halves of the image, to `sums` [N], and 1 to `views` [N]."""
+    inputs = [view(taken, wp.uint8), view(v_means2d, wp.vec2), wp.vec2(0.5 * width, 0.5 * height)]
+    outputs = [view(sums, wp.float32), view(views, wp.int32)]
+    launch(kernels.note_gradients, len(sums), inputs, outputs, device=sums.device)
+
+
+def add_noise(means: Tensor, quats: Tensor, scales: Tensor, opacities: Tensor, seed: int, size: float) -> None:
+    """Move faint Gaussians within their own extent, by a random number that depends on the seed and the row alone."""
+    inputs = [
+        view(quats, wp.vec4),
+        view(scales, wp.vec3),
+        view(opacities, wp.float32),
+        seed,
+        size,
+    ]
+    launch(kernels.add_noise, len(means), inputs, [view(means, wp.vec3)], device=means.device)

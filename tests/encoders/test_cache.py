@@ -1,0 +1,194 @@
+"""The disk cache: nothing is encoded twice, nothing wrong is ever given back."""
+
+import os
+
+import numpy as np
+import pytest
+import torch
+
+from sgwarp.encoders import cache
+from sgwarp.encoders.base import MapSource, TextEncoder
+from sgwarp.encoders.cache import CachedMaps, default_folder, pack, shrink, unpack
+from sgwarp.errors import InputError
+from sgwarp.scene import FeatureMap
+
+
+class Source:
+    """Counts how often it is asked."""
+
+    space, needs_image = "toy-8", True
+
+    def __init__(self, key="settings"):
+        self.key, self.asked = key, 0
+
+    def cache_key(self, view):
+        return self.key
+
+    def encode(self, view, image):
+        self.asked += 1
+        ids = (image[..., 0] * 3).long() - 1
+        vectors = torch.randn(3, 8, generator=torch.Generator().manual_seed(int(image.sum())))
+        return FeatureMap(self.space, ids=ids, vectors=vectors)
+
+    def encode_text(self, texts):
+        return torch.ones(len(texts), 8)
+
+
+def same(one: FeatureMap, other: FeatureMap) -> bool:
+    return torch.equal(one.ids, other.ids) and torch.equal(one.vectors, other.vectors)
+
+
+def test_encoded_once(tmp_path, view, image):
+    source = Source()
+    cached = CachedMaps(source, tmp_path)
+    assert isinstance(cached, MapSource)
+    assert isinstance(cached, TextEncoder)
+    first = cached.encode(view, image)
+    assert same(cached.encode(view, image), first)  # the same bits, not only nearly
+    assert (source.asked, cached.hits) == (1, 1)
+    later = Source()
+    assert same(CachedMaps(later, tmp_path).encode(view, image.clone()), first)
+    assert later.asked == 0
+    exact = Source().encode(view, image)
+    torch.testing.assert_close(first.vectors, exact.vectors, rtol=2**-11, atol=1e-6)
+    assert torch.equal(first.ids, exact.ids)
+
+
+def test_everything_that_matters_makes_another_map(tmp_path, view, image):
+    changed = image.clone()
+    changed[3, 4, 1] += 1 / 255
+    source = Source()
+    for picture in (image, changed, image[:40], image.transpose(0, 1)):
+        CachedMaps(source, tmp_path).encode(view, picture)
+    assert source.asked == 4
+    other = Source("other settings")
+    CachedMaps(other, tmp_path).encode(view, image)
+    assert other.asked == 1
+
+
+def test_another_version_encodes_again(tmp_path, view, image, monkeypatch):
+    source = Source()
+    CachedMaps(source, tmp_path).encode(view, image)
+    monkeypatch.setattr(cache, "__version__", "99.0")
+    CachedMaps(source, tmp_path).encode(view, image)
+    assert source.asked == 2
+
+
+@pytest.mark.parametrize("damage", ["cut", "flipped", "empty", "text"])
+def test_damaged_files_are_made_again(tmp_path, view, image, damage):
+    source = Source()
+    cached = CachedMaps(source, tmp_path)
+    first = cached.encode(view, image)
+    (path,) = tmp_path.glob("*.npz")
+    content = bytearray(path.read_bytes())
+    if damage == "cut":
+        content = content[: len(content) // 2]
+    elif damage == "flipped":
+        content[len(content) // 3] ^= 255
+    elif damage == "empty":
+        content = bytearray()
+    else:
+        content = bytearray(b"not an archive at all")
+    path.write_bytes(bytes(content))
+    assert same(cached.encode(view, image), first)
+    assert source.asked == 2
+    assert same(cached.encode(view, image), first)
+    assert source.asked == 2
+
+
+def test_the_least_recently_used_go_first(tmp_path, view, image):
+    source = Source()
+    pictures = [(image + k / 10).clamp(0, 1) for k in range(4)]
+    cached = CachedMaps(source, tmp_path)
+    names = []
+    for age, picture in enumerate(pictures[:3]):
+        before = set(tmp_path.iterdir())
+        cached.encode(view, picture)
+        (path,) = set(tmp_path.iterdir()) - before
+        os.utime(path, (1000 + age, 1000 + age))
+        names.append(path)
+    cached.encode(view, pictures[0])  # used again: now the second is the oldest
+    size = max(path.stat().st_size for path in names)
+    CachedMaps(source, tmp_path, limit=3.2 * size / 1e9).encode(view, pictures[3])
+    assert names[0].exists()
+    assert not names[1].exists()
+    assert names[2].exists()
+    assert len(list(tmp_path.iterdir())) == 3
+
+
+def test_a_map_larger_than_the_limit_stays_until_the_next(tmp_path, view, image):
+    cached = CachedMaps(Source(), tmp_path, limit=1e-9)
+    cached.encode(view, image)
+    assert len(list(tmp_path.iterdir())) == 1
+    cached.encode(view, image / 2)
+    assert len(list(tmp_path.iterdir())) == 1
+    (tmp_path / "mine.txt").touch()
+    shrink(tmp_path, 1e-12)
+    assert [path.name for path in tmp_path.iterdir()] == ["mine.txt"]  # only maps are removed
+
+
+MAPS = {
+    "ids": FeatureMap("s", ids=torch.tensor([[0, -1], [1, 1]]), vectors=torch.tensor([[0.5, 0.25], [1.0, 2.0]])),
+    "labels": FeatureMap("labels", ids=torch.tensor([[0, -1], [1, 1]]), labels=("3", "40000")),
+    "many ids": FeatureMap("s", ids=torch.arange(40000).view(200, 200), vectors=torch.zeros(40000, 1)),
+    "dense": FeatureMap("s", dense=torch.rand(2, 3, 4).half(), valid=torch.tensor([[True, False, True]] * 2)),
+    "shares": FeatureMap("labels", dense=torch.rand(2, 3, 2), labels=("a", "b")),
+    "huge": FeatureMap("s", dense=torch.tensor([[[1e6, 1.0, 3.3]]])),
+    "tiny": FeatureMap("s", dense=torch.tensor([[[1e-6, 2e-7]]])),
+    "nothing": FeatureMap("s", ids=torch.tensor([[-1]]), vectors=torch.zeros(0, 3)),
+}
+
+
+@pytest.mark.parametrize("name", MAPS)
+def test_every_kind_of_map_survives(name):
+    found = unpack(pack(MAPS[name]))
+    assert (found.space, found.labels) == (MAPS[name].space, MAPS[name].labels)
+    for part in ("ids", "valid"):
+        mine, theirs = getattr(found, part), getattr(MAPS[name], part)
+        assert (mine is None) == (theirs is None)
+        assert mine is None or torch.equal(mine, theirs)
+    for part in ("dense", "vectors"):
+        mine, theirs = getattr(found, part), getattr(MAPS[name], part)
+        assert (mine is None) == (theirs is None)
+        if mine is not None:
+            torch.testing.assert_close(mine.float(), theirs.float(), rtol=2**-11, atol=0)
+
+
+def test_maps_are_small_on_disk(tmp_path, view, image):
+    CachedMaps(Source(), tmp_path).encode(view, image)
+    (path,) = tmp_path.iterdir()
+    with np.load(path) as stored:
+        assert stored["ids"].dtype == np.int8
+        assert stored["vectors"].dtype == np.float16
+    assert path.stat().st_size < image.nbytes
+
+
+def test_sources_without_a_key_are_always_asked(tmp_path, view, image):
+    source = Source(key=None)
+    cached = CachedMaps(source, tmp_path)
+    for _ in range(2):
+        cached.encode(view, image)
+    assert source.asked == 2
+    assert not list(tmp_path.iterdir())
+
+
+def test_default_folder(monkeypatch, tmp_path):
+    monkeypatch.setenv("SGWARP_CACHE", str(tmp_path / "here"))
+    assert default_folder() == tmp_path / "here"
+    monkeypatch.delenv("SGWARP_CACHE")
+    monkeypatch.setattr("sys.platform", "linux")
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
+    assert default_folder() == tmp_path / "sgwarp" / "maps"
+    monkeypatch.delenv("XDG_CACHE_HOME")
+    monkeypatch.setenv("HOME", str(tmp_path))
+    assert default_folder() == tmp_path / ".cache" / "sgwarp" / "maps"
+    monkeypatch.setattr("sys.platform", "darwin")
+    assert default_folder() == tmp_path / "Library" / "Caches" / "sgwarp" / "maps"
+
+
+def test_bad_places(tmp_path):
+    (tmp_path / "file").touch()
+    with pytest.raises(InputError, match=r"cannot be made .*; choose another, or none"):
+        CachedMaps(Source(), tmp_path / "file" / "below")
+    with pytest.raises(InputError, match="limit above 0"):
+        CachedMaps(Source(), tmp_path, limit=0.0)

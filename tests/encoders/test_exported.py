@@ -1,0 +1,286 @@
+"""What other programs export: VLPart's instances, DEVA's ids, masks, Feature 3DGS's maps; written here by hand."""
+
+import json
+
+import cv2
+import numpy as np
+import pytest
+import torch
+
+from sgwarp.encoders.base import UNRANKED
+from sgwarp.encoders.deva import DevaMaps
+from sgwarp.encoders.file_masks import FileMasks
+from sgwarp.encoders.files import FileMaps, MissingMap
+from sgwarp.encoders.vlpart import VLPartFiles, decode_rle, plain_name
+from sgwarp.errors import InputError
+
+MASK = np.zeros((48, 64), bool)
+MASK[10:30, 5:40] = True
+MASK[12:14, 20:22] = False
+MASK[0, 0] = MASK[47, 63] = True
+
+
+def runs(mask: np.ndarray) -> list[int]:
+    """Lengths of runs, column by column, beginning with zeros."""
+    counts, current = [], False
+    length = 0
+    for value in mask.T.ravel():
+        if bool(value) != current:
+            counts.append(length)
+            current, length = bool(value), 0
+        length += 1
+    return [*counts, length]
+
+
+def as_text(counts: list[int]) -> str:
+    """COCO's characters: differences to the run two before from the third on, five bits each with a sign."""
+    text = ""
+    for k, count in enumerate(counts):
+        value = count - (counts[k - 2] if k > 2 else 0)
+        more = True
+        while more:
+            bits = value & 31
+            value >>= 5
+            more = value != -1 if bits & 16 else value != 0
+            text += chr((bits | 32 if more else bits) + 48)
+    return text
+
+
+@pytest.mark.parametrize("mask", [MASK, ~MASK, np.zeros((48, 64), bool), np.ones((48, 64), bool), MASK[:7, :3]])
+def test_run_lengths(mask):
+    for counts in (runs(mask), as_text(runs(mask))):
+        np.testing.assert_array_equal(decode_rle({"size": mask.shape, "counts": counts}), mask)
+
+
+def test_run_lengths_of_random_masks():
+    rng = np.random.default_rng(0)
+    for _ in range(20):
+        mask = rng.random((rng.integers(1, 40), rng.integers(1, 40))) < rng.random()
+        np.testing.assert_array_equal(decode_rle({"size": mask.shape, "counts": as_text(runs(mask))}), mask)
+
+
+ROWS = [
+    {"box": [5, 10, 40, 30], "name": "dog:head", "score": 0.9},
+    {"box": [1.5, 2, 60, 44], "name": "dog_tail", "score": 0.3},
+]
+
+
+def write_json(path, rows):
+    path.write_text(json.dumps({"instances": rows}))
+
+
+def test_vlpart_json(tmp_path, view, image):
+    write_json(tmp_path / "a.json", ROWS)
+    found = VLPartFiles(tmp_path).find(view, image)
+    assert found.names == ("dog head", "dog tail")
+    assert found.boxes.tolist() == [[5, 10, 40, 30], [1.5, 2, 60, 44]]
+    assert found.scores.tolist() == pytest.approx([0.9, 0.3])
+    assert found.masks is None
+    assert VLPartFiles(tmp_path, least_score=0.5).find(view, image).names == ("dog head",)
+
+
+def test_vlpart_masks(tmp_path, view, image):
+    masked = [
+        {**row, "mask": {"size": [48, 64], "counts": runs(mask)}} for row, mask in zip(ROWS, (MASK, ~MASK), strict=True)
+    ]
+    write_json(tmp_path / "a.json", masked)
+    found = VLPartFiles(tmp_path, least_score=0.1).find(view, image)
+    np.testing.assert_array_equal(found.masks, np.stack([MASK, ~MASK]))
+    (tmp_path / "a.json").unlink()
+    arrays = {"boxes": [row["box"] for row in ROWS], "names": [row["name"] for row in ROWS], "scores": [0.9, 0.3]}
+    np.savez(tmp_path / "a.npz", masks=np.stack([MASK, ~MASK]), **arrays)
+    other = VLPartFiles(tmp_path, least_score=0.1).find(view, image)
+    assert other.names == found.names
+    assert torch.equal(other.boxes, found.boxes)
+    assert torch.equal(other.masks, found.masks)
+
+
+def test_vlpart_finds_nothing(tmp_path, view, image):
+    write_json(tmp_path / "a.json", [])
+    assert VLPartFiles(tmp_path).find(view, image).boxes.shape == (0, 4)
+
+
+def test_identity_is_the_files_content(tmp_path, view):
+    write_json(tmp_path / "a.json", ROWS)
+    source = VLPartFiles(tmp_path)
+    before = source.identity_of(view)
+    assert VLPartFiles(tmp_path).identity_of(view) == before
+    write_json(tmp_path / "a.json", ROWS[:1])
+    assert source.identity_of(view) != before
+
+
+@pytest.mark.parametrize(
+    ("content", "message"),
+    [
+        ("{", "is not JSON"),
+        ("[]", r"expected \{\"instances\""),
+        (json.dumps({"instances": [{"box": [0, 0, 1], "name": "a", "score": 1}]}), "an instance is damaged"),
+        (json.dumps({"instances": [{"box": [0, 0, 1, 1], "score": 1}]}), "an instance is damaged .*name"),
+        (json.dumps({"instances": [{"box": [5, 0, 1, 1], "name": "a", "score": 1}]}), "x1 < x2"),
+        (json.dumps({"instances": [{"box": [0, 0, 1, 1], "name": " ", "score": 1}]}), "has no name"),
+        (
+            json.dumps(
+                {"instances": [{"box": [0, 0, 1, 1], "name": "a", "score": 1, "mask": {"size": [2, 2], "counts": [3]}}]}
+            ),
+            "add up to 3, not 2 x 2",
+        ),
+        (
+            json.dumps(
+                {
+                    "instances": [
+                        {"box": [0, 0, 1, 1], "name": "a", "score": 1, "mask": {"size": [2, 2], "counts": "~~"}}
+                    ]
+                }
+            ),
+            "an instance is damaged",
+        ),
+        (
+            json.dumps(
+                {
+                    "instances": [
+                        {"box": [0, 0, 1, 1], "name": "a", "score": 1, "mask": {"size": [2, 9], "counts": [18]}}
+                    ]
+                }
+            ),
+            r"masks are 9 x 2, not the shape of view a \(64 x 48\)",
+        ),
+    ],
+)
+def test_damaged_instances(tmp_path, view, image, content, message):
+    (tmp_path / "a.json").write_text(content)
+    with pytest.raises(InputError, match=message):
+        VLPartFiles(tmp_path).find(view, image)
+
+
+def test_missing_instances(tmp_path, view, image):
+    with pytest.raises(InputError, match="no such folder"):
+        VLPartFiles(tmp_path / "none")
+    source = VLPartFiles(tmp_path)
+    assert not source.has_map(view)
+    with pytest.raises(MissingMap, match=r"holds no a\.json or a\.npz"):
+        source.find(view, image)
+    (tmp_path / "a.npz").write_bytes(b"PK\x03\x04 and so on")
+    with pytest.raises(InputError, match=r"is not an \.npz of arrays"):
+        source.find(view, image)
+    np.savez(tmp_path / "a.npz", boxes=np.zeros((1, 4)))
+    with pytest.raises(InputError, match="lacks the array names"):
+        source.find(view, image)
+
+
+def test_names_as_one_says_them():
+    assert plain_name("office_chair:left_arm") == "office chair left arm"
+
+
+@pytest.fixture
+def deva(tmp_path):
+    """Two frames of a video with long ids; a third view has none."""
+    pictures = tmp_path / "Annotations"
+    pictures.mkdir()
+    ids = np.zeros((48, 64), np.int64)
+    ids[5:20, 5:20], ids[25:40, 30:60] = 70000, 513
+    frames = []
+    for stem in ("a", "b"):
+        shown = ids if stem == "a" else np.where(ids == 513, 0, ids)
+        cv2.imwrite(
+            str(pictures / f"{stem}.png"), np.stack([shown >> 16, shown >> 8 & 255, shown & 255], -1).astype(np.uint8)
+        )
+        segments = [{"id": int(k), "category_id": 1, "score": 0.9 if k == 513 else 0.4} for k in np.unique(shown) if k]
+        frames.append({"file_name": f"{stem}.jpg", "segments_info": segments})
+    (tmp_path / "pred.json").write_text(json.dumps({"annotations": frames}))
+    return tmp_path, ids
+
+
+def test_deva(deva, tools):
+    folder, ids = deva
+    views = [tools.make_view(stem=stem) for stem in "abc"]
+    source = DevaMaps(folder, views)
+    found = source.encode(views[0])
+    assert (found.space, found.labels) == ("labels", ("513", "70000"))
+    wanted = np.select([ids == 513, ids == 70000], [0, 1], -1)
+    np.testing.assert_array_equal(found.ids[0], wanted)
+    assert source.encode(views[1]).ids.unique().tolist() == [-1, 1]
+    assert not source.has_map(views[2])
+    sure = DevaMaps(folder, views, least_score=0.5).encode(views[0])
+    np.testing.assert_array_equal(sure.ids[0], np.where(wanted == 1, -1, wanted))
+
+
+def test_deva_with_a_folder_per_video(deva, tools):
+    folder, _ = deva
+    inner = folder / "Annotations" / "video"
+    inner.mkdir()
+    for path in (folder / "Annotations").glob("*.png"):
+        path.rename(inner / path.name)
+    view = tools.make_view()
+    assert DevaMaps(folder, [view]).encode(view).ids.unique().tolist() == [-1, 0, 1]
+
+
+def test_deva_says_what_does_not_fit(deva, tools, tmp_path_factory):
+    folder, _ = deva
+    view = tools.make_view()
+    content = json.loads((folder / "pred.json").read_text())
+    content["annotations"][0]["segments_info"].pop()
+    (folder / "pred.json").write_text(json.dumps(content))
+    with pytest.raises(InputError, match=r"pred\.json: lists no segment \d+ in frame a, which shows it"):
+        DevaMaps(folder, [view]).encode(view)
+    (folder / "pred.json").write_text(json.dumps({"annotations": []}))
+    with pytest.raises(InputError, match=r"pred\.json: lists no frame a"):
+        DevaMaps(folder, [view]).encode(view)
+    (folder / "pred.json").write_text("{}")
+    with pytest.raises(InputError, match=r"is not the pred\.json of DEVA"):
+        DevaMaps(folder, [view])
+    with pytest.raises(InputError, match="has no folder Annotations"):
+        DevaMaps(tmp_path_factory.mktemp("empty"), [view])
+
+
+def test_masks_of_label_images(tmp_path, view, image):
+    ids = np.zeros((24, 32), np.uint8)
+    ids[2:8, 3:9], ids[10:20, 10:30] = 7, 3
+    cv2.imwrite(str(tmp_path / "a.png"), ids)
+    found = FileMasks(tmp_path).everything(view, image)
+    np.testing.assert_array_equal(found.masks, np.stack([ids == 3, ids == 7]))
+    assert found.ranks.tolist() == [UNRANKED] * 2
+
+
+def test_stacks_of_masks(tmp_path, view, image):
+    np.savez(tmp_path / "a.npz", masks=np.stack([MASK, ~MASK]), scores=[0.5, 0.25], ranks=[2, 0])
+    found = FileMasks(tmp_path).everything(view, image)
+    np.testing.assert_array_equal(found.masks, np.stack([MASK, ~MASK]))
+    assert (found.scores.tolist(), found.ranks.tolist()) == ([0.5, 0.25], [2, 0])
+    before = FileMasks(tmp_path).identity_of(view)
+    np.savez(tmp_path / "a.npz", masks=MASK[None])
+    assert FileMasks(tmp_path).identity_of(view) != before
+    with pytest.raises(InputError, match="cannot be asked for the mask of a box"):
+        FileMasks(tmp_path).in_boxes(image, torch.zeros(1, 4))
+
+
+@pytest.mark.parametrize(
+    ("arrays", "message"),
+    [
+        ({"other": np.zeros(3)}, r"expected an array masks \[M, h, w\]"),
+        ({"masks": np.zeros((2, 48, 64)), "scores": np.zeros(3)}, "expected 2 scores and ranks"),
+        ({"masks": np.zeros((2, 48, 48))}, r"is 48 x 48, not the shape of view a \(64 x 48\)"),
+    ],
+)
+def test_stacks_that_do_not_fit(tmp_path, view, image, arrays, message):
+    np.savez(tmp_path / "a.npz", **arrays)
+    with pytest.raises(InputError, match=message):
+        FileMasks(tmp_path).everything(view, image)
+
+
+def test_missing_masks(tmp_path, view, image):
+    with pytest.raises(InputError, match="no such folder"):
+        FileMasks(tmp_path / "none")
+    with pytest.raises(MissingMap):
+        FileMasks(tmp_path).everything(view, image)
+    (tmp_path / "a.npz").write_bytes(b"PK\x03\x04 and so on")
+    with pytest.raises(InputError, match=r"is not an \.npz of arrays"):
+        FileMasks(tmp_path).everything(view, image)
+
+
+def test_feature_3dgs(tmp_path, tools):
+    view = tools.make_view(40, 40)
+    features = torch.randn(6, 20, 20).half()
+    torch.save(features, tmp_path / "a_fmap_CxHxW.pt")
+    source = FileMaps(tmp_path, [view])
+    assert torch.equal(source.encode(view).dense, features.permute(1, 2, 0))  # square: only the name tells the layout
+    assert source.space == "files:6"

@@ -1,0 +1,153 @@
+"""Names of encoders, what is made of them, and what is said when they do not fit."""
+
+import importlib.util
+
+import cv2
+import numpy as np
+import pytest
+import torch
+
+from sgwarp.encoders import catalogue
+from sgwarp.encoders.cache import CachedMaps
+from sgwarp.encoders.catalogue import BY_NAME, KINDS
+from sgwarp.encoders.clip import JointEncoder
+from sgwarp.encoders.compose import Crops, MaskedImages, PaintedInstances, PlainPixels, RefinedPixels
+from sgwarp.encoders.ensemble import Ensemble
+from sgwarp.encoders.file_masks import FileMasks
+from sgwarp.encoders.names import parse
+from sgwarp.encoders.proposals import Proposals
+from sgwarp.encoders.registry import make_encoder, make_text_encoder, text_encoder_for
+from sgwarp.encoders.sam import Sam
+from sgwarp.encoders.vlpart import VLPartFiles
+from sgwarp.errors import InputError
+
+
+def test_parts():
+    (member,) = parse("clip:some/path+with+plus?longest=64&templates=room,the {}+sam:x?points=4&levels=s,m")
+    assert (member.source.kind.name, member.source.argument) == ("clip", "some/path+with+plus")
+    assert member.source.options == {"longest": 64, "templates": ("room", "the {}")}
+    assert (member.masks.kind.name, member.masks.argument) == ("sam", "x")
+    assert member.masks.options == {"points": 4, "levels": ("s", "m")}
+    assert (member.text, member.weight) == (None, 1.0)
+
+
+def test_members():
+    first, second, third = parse("conse@2++clip:a+graph@0.5++gdino:b?classes=x+sam:c+text:clip:d")
+    assert [member.source.kind.name for member in (first, second, third)] == ["conse", "clip", "gdino"]
+    assert [member.weight for member in (first, second, third)] == [2.0, 0.5, 1.0]
+    assert second.masks.kind.name == "graph"
+    assert third.text == "clip:d"
+
+
+@pytest.mark.parametrize("kind", KINDS, ids=lambda kind: kind.name)
+def test_every_example_is_a_name(kind):
+    (member,) = parse(kind.example)
+    assert kind.name in {member.source.kind.name, member.masks.kind.name if member.masks else ""}
+
+
+@pytest.mark.parametrize(
+    ("name", "message"),
+    [
+        ("klip:x", r"encoder 'klip:x' does not exist; there are conse, clip, .* \(see: sgwarp encoders\)"),
+        ("clip", "write clip:PATH"),
+        ("clip:x?size=3", "clip has no option 'size'; its options are: templates, longest, rule"),
+        ("clip:x?longest=far", "option longest: expected a number, got 'far'"),
+        ("clip:x?longest=", "option longest has no value"),
+        ("conse+graph?background=maybe", "option background: expected yes or no, got 'maybe'"),
+        ("graph", "graph gives masks only"),
+        ("graph:x", "graph takes nothing after a colon"),
+        ("conse+clip:x", r"'clip:x' does not go with 'conse'; put \+\+ between two encoders"),
+        ("conse+graph+slic", "'slic' does not go with 'conse'"),
+        ("files:x+graph", "'graph' does not go with 'files:x'"),
+        ("conse+text:conse+graph", r"\+text:NAME goes last"),
+        ("vlpart:x+text:", r"\+text:NAME goes last"),
+    ],
+)
+def test_names_that_do_not_fit(name, message):
+    with pytest.raises(InputError, match=message):
+        parse(name)
+
+
+def test_rules_follow_from_the_parts(joint_models, sam_models, tmp_path):
+    clip, sam = f"clip:{joint_models['clip']}", f"sam:{sam_models['sam']}"
+    plain = make_encoder(f"{clip}?longest=64")
+    assert isinstance(plain, PlainPixels)
+    assert plain.encoder.longest == 64
+    masked = make_encoder(f"{clip}+{sam}?points=2&levels=s,l&background=no")
+    assert isinstance(masked, MaskedImages)
+    assert isinstance(masked.encoder, Crops)
+    assert isinstance(masked.encoder.encoder, JointEncoder)
+    assert isinstance(masked.generator, Sam)
+    assert (masked.levels, masked.encoder.background) == (("s", "l"), False)
+    assert (masked.generator.settings.points, masked.generator.settings.by_rank) == (2, True)
+    refined = make_encoder(f"{clip}?rule=pixels+graph?rest=own&scales=50,100")
+    assert isinstance(refined, RefinedPixels)
+    assert refined.rest == "own"
+    assert refined.generator == Proposals("graph", (50.0, 100.0))
+    (tmp_path / "m").mkdir()
+    assert isinstance(make_encoder(f"{clip}+masks:{tmp_path / 'm'}").generator, FileMasks)
+    painted = make_encoder(f"vlpart:{tmp_path / 'm'}?least_score=0.3+{sam}+text:{clip}")
+    assert isinstance(painted, PaintedInstances)
+    assert isinstance(painted.detector, VLPartFiles)
+    assert painted.space == plain.space
+    with pytest.raises(InputError, match="rule is images or pixels, not 'words'"):
+        make_encoder(f"{clip}?rule=words")
+
+
+def test_clip_and_sam_end_to_end(joint_models, sam_models, view, image):
+    """Whatever random networks see: a map in CLIP's space that its phrases can be compared with."""
+    name = f"clip:{joint_models['clip']}+sam:{sam_models['sam']}?points=3&least_score=-9&least_stability=0"
+    source = make_encoder(name)
+    source.generator.settings = type(source.generator.settings)(
+        points=3, least_score=-9.0, least_stability=0.0, offset=0.0
+    )
+    found = source.encode(view, image)
+    assert found.space == source.space == text_encoder_for(source.space, name).space
+    assert found.vectors.shape[1] == source.encode_text(["couch"]).shape[1] == 24
+
+
+def test_ensembles_and_caches(joint_models, tmp_path, view, image):
+    name = f"clip:{joint_models['clip']}@3++siglip:{joint_models['siglip']}@1"
+    source = make_encoder(name, cache=tmp_path / "maps", cache_limit=1.0)
+    assert isinstance(source, CachedMaps)
+    assert isinstance(source.source, Ensemble)
+    assert source.source.weights == (0.75, 0.25)
+    found = source.encode(view, image)
+    assert found.channels == 24 + 32
+    texts = text_encoder_for(source.space, name)
+    assert texts.space == source.space
+    torch.testing.assert_close(texts.encode_text(["couch"]), source.encode_text(["couch"]))
+
+
+def test_files_are_not_cached(tmp_path, view):
+    cv2.imwrite(str(tmp_path / "a.png"), np.full((48, 64), 3, np.uint8))
+    source = make_encoder(f"files:{tmp_path}", [view], cache=tmp_path / "maps")
+    assert not isinstance(source, CachedMaps)
+    assert not (tmp_path / "maps").exists()
+
+
+def test_text_sides(joint_models, tmp_path):
+    clip, siglip = (f"{kind}:{joint_models[kind]}" for kind in ("clip", "siglip"))
+    encoder = make_text_encoder(clip)
+    assert text_encoder_for(encoder.space, clip).space == encoder.space
+    with pytest.raises(InputError, match=f"space '{encoder.space}' cannot be mixed with space 'siglip-32-"):
+        text_encoder_for(encoder.space, siglip)
+    with pytest.raises(InputError, match=r"vlpart has no text side of its own; add one, such as \+text:conse"):
+        make_encoder(f"vlpart:{tmp_path}")
+    plain = make_text_encoder(clip, templates=["plain"]).encode_text(["couch"])
+    assert not torch.allclose(plain, encoder.encode_text(["couch"]))
+    torch.testing.assert_close(plain, make_text_encoder(f"{clip}?templates={{}}").encode_text(["couch"]))
+
+
+def test_features_per_gaussian_are_no_source_of_maps():
+    with pytest.raises(InputError, match=r"holds features per Gaussian, not per view; read it with sg\.load_openscene"):
+        make_encoder("openscene:x.pt")
+
+
+def test_what_is_installed(monkeypatch):
+    monkeypatch.setattr(
+        catalogue, "find_spec", lambda name: None if name == "tensorflow" else importlib.util.find_spec("os")
+    )
+    assert BY_NAME["openseg"].missing == ["tensorflow"]
+    assert BY_NAME["lseg"].missing == []
+    assert BY_NAME["graph"].missing == []
