@@ -11,6 +11,10 @@ from typing import TYPE_CHECKING, Any
 from sgwarp.version import __version__ as __version__
 
 if TYPE_CHECKING:
+    from sgwarp.distill.data import TrainingScene as TrainingScene
+    from sgwarp.distill.data import scenes_in as scenes_in
+    from sgwarp.distill.settings import DistillSettings as DistillSettings
+    from sgwarp.distill.train import distill as distill
     from sgwarp.encoders.registry import make_encoder as make_encoder
     from sgwarp.encoders.registry import text_encoder_for as text_encoder_for
     from sgwarp.errors import InputError as InputError
@@ -25,11 +29,15 @@ if TYPE_CHECKING:
     from sgwarp.io.store import save_semantics as save_semantics
     from sgwarp.io.views import load_views as load_views
     from sgwarp.lift import lift as lift
+    from sgwarp.network import SemanticNetwork as SemanticNetwork
+    from sgwarp.network import load_network as load_network
+    from sgwarp.network import save_network as save_network
     from sgwarp.ops.contributors import top_contributors as top_contributors
     from sgwarp.ops.differentiable import rasterize as rasterize
     from sgwarp.ops.plan import RenderPlan as RenderPlan
     from sgwarp.ops.settings import RasterSettings as RasterSettings
     from sgwarp.orbit import orbit_views as orbit_views
+    from sgwarp.predict import predict as predict
     from sgwarp.query import evidence as evidence
     from sgwarp.query import query as query
     from sgwarp.query import relevancy as relevancy
@@ -48,6 +56,7 @@ if TYPE_CHECKING:
 
 _HOME = {
     "Camera": "sgwarp.scene",
+    "DistillSettings": "sgwarp.distill.settings",
     "FeatureMap": "sgwarp.scene",
     "FitSettings": "sgwarp.fitting.settings",
     "Gaussians": "sgwarp.scene",
@@ -55,13 +64,17 @@ _HOME = {
     "RasterSettings": "sgwarp.ops.settings",
     "RenderPlan": "sgwarp.ops.plan",
     "RunLog": "sgwarp.runlog",
+    "SemanticNetwork": "sgwarp.network",
     "Semantics": "sgwarp.scene",
+    "TrainingScene": "sgwarp.distill.data",
     "View": "sgwarp.scene",
+    "distill": "sgwarp.distill.train",
     "evidence": "sgwarp.query",
     "fit": "sgwarp.fit",
     "gaussians_from_depth": "sgwarp.from_depth",
     "lift": "sgwarp.lift",
     "load_gaussians": "sgwarp.io.scenes",
+    "load_network": "sgwarp.network",
     "load_openscene": "sgwarp.io.openscene",
     "load_points": "sgwarp.io.points",
     "load_semantics": "sgwarp.io.store",
@@ -69,13 +82,16 @@ _HOME = {
     "localize": "sgwarp.segment",
     "make_encoder": "sgwarp.encoders.registry",
     "orbit_views": "sgwarp.orbit",
+    "predict": "sgwarp.predict",
     "plan": "sgwarp.render",
     "query": "sgwarp.query",
     "rasterize": "sgwarp.ops.differentiable",
     "relevancy": "sgwarp.query",
     "render": "sgwarp.render",
     "save_gaussians": "sgwarp.io.scenes",
+    "save_network": "sgwarp.network",
     "save_semantics": "sgwarp.io.store",
+    "scenes_in": "sgwarp.distill.data",
     "segment": "sgwarp.segment",
     "select": "sgwarp.query",
     "standardise": "sgwarp.query",

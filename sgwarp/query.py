@@ -10,6 +10,7 @@ from torch import Tensor
 
 from sgwarp.encoders.base import TextEncoder
 from sgwarp.encoders.prompts import CANONICAL
+from sgwarp.ensemble import Ensemble, combine, require_together, seen_by
 from sgwarp.errors import InputError
 from sgwarp.scene import Semantics
 
@@ -108,6 +109,9 @@ def class_votes(
     encoder: TextEncoder | None = None,
     temperature: float | None = None,
     scoring: Scoring = "cosine",
+    *,
+    predicted: Semantics | None = None,
+    ensemble: Ensemble = "max",
 ) -> Tensor:
     """How much every Gaussian speaks for every class, float32 [N, Q]; 0 where nothing was seen.
 
@@ -123,29 +127,54 @@ def class_votes(
         encoder: Text encoder of the semantics' space.
         temperature: Of the softmax; None for 0.3 (evidence) or 0.1 (cosine).
         scoring: See above.
+        predicted: Semantics that the network predicts for the same Gaussians; the scores of the two become one before
+            the softmax (paper, Sec. III-D), shares before they are made to add up to 1 again.
+        ensemble: How, see `combine`.
 
     Raises:
-        InputError: No classes, or an encoder missing, where one is needed; a class that is not among the lifted labels.
+        InputError: No classes, or an encoder missing, where one is needed; a class that is not among the lifted labels;
+            predicted semantics of another scene or space.
     """
+    both = [semantics]
+    if predicted is not None:
+        require_together(semantics, predicted)
+        both.append(predicted)
+    seen = seen_by(semantics, predicted, ensemble)
     if semantics.labels is not None:
-        if classes is None:
-            return semantics.features.to(torch.float32)
-        missing = [name for name in classes if name not in semantics.labels]
-        if missing:
-            raise InputError(f"class '{missing[0]}' is not among the lifted labels: {', '.join(semantics.labels)}")
-        return semantics.features[:, [semantics.labels.index(name) for name in classes]].to(torch.float32)
+        shares = _together([_label_shares(one, classes) for one in both], both, ensemble)
+        return shares / shares.sum(dim=1, keepdim=True).clamp(min=1.0) if predicted is not None else shares
     if not classes:
         raise InputError(f"classes: semantics in space '{semantics.space}' need the names of the classes to look for")
     if encoder is None:
         raise InputError(f"encoder: classes need the text encoder of space '{semantics.space}'")
     if scoring not in TEMPERATURES:
         raise InputError(f"scoring: expected one of {', '.join(TEMPERATURES)}, got '{scoring}'")
-    scores = query(semantics, classes, encoder)
+    each = [query(one, classes, encoder) for one in both]
     if scoring == "evidence":
-        scores = evidence(scores, semantics)
+        each = [evidence(scores, one) for scores, one in zip(each, both, strict=True)]
+    scores = _together(each, both, ensemble)
+    if scoring == "evidence":
         scores = torch.cat([scores, torch.full_like(scores[:, :1], NONE_LEVEL)], dim=1)
     votes = confidence(scores, TEMPERATURES[scoring] if temperature is None else temperature)[:, : len(classes)]
-    return torch.where(semantics.seen.to(votes.device)[:, None], votes, 0.0)
+    return torch.where(seen.to(votes.device)[:, None], votes, 0.0)
+
+
+def _label_shares(semantics: Semantics, classes: Sequence[str] | None) -> Tensor:
+    """Lifted or predicted shares of the labels, [N, Q]."""
+    assert semantics.labels is not None
+    if classes is None:
+        return semantics.features.to(torch.float32)
+    missing = [name for name in classes if name not in semantics.labels]
+    if missing:
+        raise InputError(f"class '{missing[0]}' is not among the lifted labels: {', '.join(semantics.labels)}")
+    return semantics.features[:, [semantics.labels.index(name) for name in classes]].to(torch.float32)
+
+
+def _together(scores: list[Tensor], semantics: list[Semantics], ensemble: Ensemble) -> Tensor:
+    """Scores of the one semantics there is, or of the ensemble of the two, [N, Q]."""
+    if len(scores) == 1:
+        return scores[0]
+    return combine(scores[0], scores[1], (semantics[0].seen, semantics[1].seen), ensemble)
 
 
 def select(scores: Tensor, threshold: float | None = None, top_share: float | None = None) -> Tensor:

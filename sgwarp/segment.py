@@ -12,6 +12,7 @@ import torch
 from torch import Tensor
 
 from sgwarp.encoders.base import TextEncoder
+from sgwarp.ensemble import Ensemble, seen_by
 from sgwarp.errors import InputError
 from sgwarp.ops.rasterize import rasterize
 from sgwarp.ops.settings import RasterSettings
@@ -63,6 +64,8 @@ def segment(
     temperature: float | None = None,
     scoring: Scoring = "cosine",
     unknown_below: float = 0.0,
+    predicted: Semantics | None = None,
+    ensemble: Ensemble = "max",
     settings: RasterSettings | None = None,
 ) -> tuple[Tensor, Tensor]:
     """Which class every pixel of a view shows.
@@ -76,6 +79,8 @@ def segment(
         temperature: Of the softmax over the classes, per Gaussian, before they are splatted; see `class_votes`.
         scoring: "evidence" leaves unknown what fits no class, "cosine" gives every pixel a class; see `class_votes`.
         unknown_below: Pixels whose best class has a smaller confidence are unknown, in [0, 1].
+        predicted: Semantics that the network predicts for the scene, to be asked together with the lifted ones.
+        ensemble: How the two become one, see `combine`; one of them alone answers where only it knows a Gaussian.
         settings: Thresholds of the rasterizer.
 
     Returns:
@@ -90,10 +95,9 @@ def segment(
     semantics.require_scene(gaussians)
     if classes is not None and len(classes) > UNKNOWN:
         raise InputError(f"classes: at most {UNKNOWN} at a time, got {len(classes)}")
-    votes = class_votes(semantics, classes, encoder, temperature, scoring)
-    channel, confidence = segment_votes(
-        gaussians, camera, votes, semantics.seen, unknown_below=unknown_below, settings=settings
-    )
+    votes = class_votes(semantics, classes, encoder, temperature, scoring, predicted=predicted, ensemble=ensemble)
+    seen = seen_by(semantics, predicted, ensemble)
+    channel, confidence = segment_votes(gaussians, camera, votes, seen, unknown_below=unknown_below, settings=settings)
     return label_image(channel, semantics if classes is None else None), confidence
 
 

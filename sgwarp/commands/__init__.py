@@ -4,10 +4,12 @@ Only `sgwarp.cli` imports this package, once tyro is known to be there; torch an
 """
 
 from sgwarp.commands.demo import Demo
+from sgwarp.commands.distill import Distill
 from sgwarp.commands.encoders import Encoders
 from sgwarp.commands.fit import Fit
 from sgwarp.commands.info import Info
 from sgwarp.commands.lift import Lift
+from sgwarp.commands.predict import Predict
 from sgwarp.commands.query import Query
 from sgwarp.commands.render import Render
 from sgwarp.commands.report import Report
@@ -16,6 +18,8 @@ from sgwarp.commands.segment import Segment
 COMMANDS = {
     "fit": Fit,
     "lift": Lift,
+    "distill": Distill,
+    "predict": Predict,
     "query": Query,
     "segment": Segment,
     "render": Render,

@@ -90,6 +90,13 @@ class SemanticsOptions(SceneOptions):
     templates: tuple[str, ...] = ()
     """What phrases are put into, such as "a photo of a {}", or plain, photo, room; the encoder's own if not given."""
 
+    predicted: Path | None = None
+    """What `sgwarp predict` wrote for this scene; it is then asked together with the lifted semantics."""
+
+    ensemble: Literal["2d", "3d", "max", "sum", "mean"] = "max"
+    """How the scores of the lifted (2d) and the predicted (3d) semantics become one; where only one of them knows a
+    Gaussian, it speaks for both."""
+
     def text_encoder(self, semantics: Semantics) -> TextEncoder:
         """The encoder of phrases in the space of the semantics.
 
@@ -108,16 +115,40 @@ class SemanticsOptions(SceneOptions):
         Raises:
             InputError: One of them cannot be read, or they do not belong together.
         """
-        from dataclasses import replace
-
-        from sgwarp.io.store import load_semantics
-
         gaussians = self.load_scene(log)
         with log.stage("read"):
-            semantics = load_semantics(self.semantics, gaussians)
-            names = ("features", "weight", "effective_views")
-            semantics = replace(semantics, **{name: getattr(semantics, name).to(self.device) for name in names})
-        return gaussians, semantics
+            return gaussians, load_on(self.semantics, gaussians)
+
+    def load_predicted(self, gaussians: Gaussians, log: RunLog) -> Semantics | None:
+        """The predicted semantics on the chosen device, None if they were not given or are not asked.
+
+        Raises:
+            InputError: They cannot be read or belong to another scene, or the ensemble needs them and has none.
+        """
+        if self.predicted is None:
+            if self.ensemble == "3d":
+                raise InputError("--ensemble 3d: needs --predicted, what `sgwarp predict` wrote for this scene")
+            return None
+        if self.ensemble == "2d":
+            log.leave_out("predicted_semantics")
+            return None
+        with log.stage("read"):
+            return load_on(self.predicted, gaussians)
+
+
+def load_on(path: Path, gaussians: Gaussians) -> Semantics:
+    """Semantics of a scene, on its device.
+
+    Raises:
+        InputError: They cannot be read, or belong to another scene.
+    """
+    from dataclasses import replace
+
+    from sgwarp.io.store import load_semantics
+
+    semantics = load_semantics(path, gaussians)
+    names = ("features", "weight", "effective_views")
+    return replace(semantics, **{name: getattr(semantics, name).to(gaussians.device) for name in names})
 
 
 def find_views(folder: Path, stem: str | None = None, photographs: bool = True) -> list[View]:

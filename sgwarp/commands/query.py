@@ -54,15 +54,18 @@ class Query(SemanticsOptions):
         if self.box < 1:
             raise InputError(f"--box: expected a side of 1 pixel or more, got {self.box}")
         with self.logged(self.out.parent) as log:
+            from sgwarp.ensemble import seen_by
             from sgwarp.io.images import write_ids, write_rgb
             from sgwarp.pictures import heat_map, mark_pixel
             from sgwarp.segment import localize
 
             gaussians, semantics = self.load_both(log)
+            predicted = self.load_predicted(gaussians, log)
+            seen = seen_by(semantics, predicted, self.ensemble)
             (view,) = find_views(self.views, self.view)
-            scores = self._scores(semantics, log)
+            scores = self._scores(semantics, predicted, log)
             with log.stage("splat"):
-                (x, y), score_map = localize(scores, gaussians, view.camera, seen=semantics.seen, box=self.box)
+                (x, y), score_map = localize(scores, gaussians, view.camera, seen=seen, box=self.box)
             mask = score_map > self.threshold
             print(f"{self.text}: best pixel ({x}, {y}), score {score_map[y, x]:.3f}; mask {mask.float().mean():.2%}")
             with log.stage("write"):
@@ -72,17 +75,24 @@ class Query(SemanticsOptions):
                 write_rgb(heat, mark_pixel(picture, (x, y)))
             log.outputs += [str(self.out), str(heat)]
 
-    def _scores(self, semantics: Semantics, log: RunLog) -> Tensor:
+    def _scores(self, semantics: Semantics, predicted: Semantics | None, log: RunLog) -> Tensor:
         """Score of every Gaussian on the scale of the mask, [N]."""
+        from sgwarp.ensemble import combine, require_together, seen_by
         from sgwarp.query import class_votes, evidence, query, relevancy, rescale
 
         if semantics.labels is not None:
-            return class_votes(semantics, [self.text])[:, 0]
+            return class_votes(semantics, [self.text], predicted=predicted, ensemble=self.ensemble)[:, 0]
         with log.stage("load_encoder"):
             encoder = self.text_encoder(semantics)
         with log.stage("query"):
-            if self.score == "cosine":
-                scores = query(semantics, [self.text], encoder)
-            else:
-                scores = relevancy(semantics, [self.text], encoder, self.canonical)
-            return rescale(evidence(scores, semantics), semantics.seen)[:, 0]
+
+            def score(one: Semantics) -> Tensor:
+                if self.score == "cosine":
+                    return evidence(query(one, [self.text], encoder), one)
+                return evidence(relevancy(one, [self.text], encoder, self.canonical), one)
+
+            scores = score(semantics)
+            if predicted is not None:
+                require_together(semantics, predicted)
+                scores = combine(scores, score(predicted), (semantics.seen, predicted.seen), self.ensemble)
+            return rescale(scores, seen_by(semantics, predicted, self.ensemble))[:, 0]

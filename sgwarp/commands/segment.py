@@ -48,17 +48,21 @@ class Segment(SemanticsOptions):
             raise InputError(f"--unknown-below: expected a confidence from 0 to 1, got {self.unknown_below}")
         classes = None if self.classes is None else class_names(self.classes)
         with self.logged(self.out) as log:
+            from sgwarp.ensemble import seen_by
             from sgwarp.query import class_votes
             from sgwarp.segment import segment_votes
 
             gaussians, semantics = self.load_both(log)
+            predicted = self.load_predicted(gaussians, log)
             views = find_views(self.views, self.view)
             encoder = None
             if classes is not None and semantics.labels is None:
                 with log.stage("load_encoder"):
                     encoder = self.text_encoder(semantics)
             with log.stage("query"):
-                votes = class_votes(semantics, classes, encoder, self.temperature, self.scoring)
+                scoring = (self.temperature, self.scoring)
+                votes = class_votes(semantics, classes, encoder, *scoring, predicted=predicted, ensemble=self.ensemble)
+                seen = seen_by(semantics, predicted, self.ensemble)
             lifted = semantics if classes is None else None
             unknown = 0.0
             with show_progress("segment") as progress:
@@ -66,7 +70,7 @@ class Segment(SemanticsOptions):
                 for done, view in enumerate(views, start=1):
                     with log.stage("segment"):
                         channel, _ = segment_votes(
-                            gaussians, view.camera, votes, semantics.seen, unknown_below=self.unknown_below
+                            gaussians, view.camera, votes, seen, unknown_below=self.unknown_below
                         )
                     with log.stage("write"):
                         log.outputs += self._write(view, photograph(gaussians, view), channel.cpu(), classes, lifted)

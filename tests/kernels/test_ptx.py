@@ -13,7 +13,7 @@ import pytest
 import warp as wp
 
 import sgwarp.kernels
-from sgwarp.kernels import compositing_block, compositing_block_backward, lifting_block, pixel_lists
+from sgwarp.kernels import compositing_block, compositing_block_backward, lifting_block, pixel_lists, voxels
 from sgwarp.ops import launch  # noqa: F401 - starts Warp quietly
 
 ARCHITECTURES = (80, 86, 89, 90)
@@ -34,6 +34,7 @@ def cuda_kernels() -> list[wp.Kernel]:
         kernels.append(lifting_block.make_lift_dense_block(flag))
         kernels.append(lifting_block.make_lift_ids_block(flag))
         kernels.append(pixel_lists.make_list_contributors(flag))
+        kernels.append(voxels.make_list_pairs(flag))
     for wide, ordered in itertools.product((False, True), repeat=2):
         # The options go together here: each adds its own lines to a kernel, and together they need most registers.
         kernels.append(compositing_block_backward.make_composite_backward_block(wide, ordered, ordered, ordered))
@@ -54,6 +55,7 @@ def test_the_list_of_kernels_is_complete():
     }
     assert factories <= names
     assert {"project_backward", "harmonics_backward", "sum_intersections", "sum_groups"} <= names
+    assert {"key_points", "list_pairs"} <= names
 
 
 @pytest.fixture(scope="module")

@@ -1,0 +1,144 @@
+"""`sgwarp distill`: train the 3D semantic network."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Literal
+
+import tyro
+
+from sgwarp.commands.options import Options, check_name
+from sgwarp.errors import InputError
+from sgwarp.progress import show_progress
+
+if TYPE_CHECKING:
+    from torch import Tensor
+
+    from sgwarp.distill.data import TrainingScene
+    from sgwarp.distill.settings import DistillSettings
+    from sgwarp.runlog import RunLog
+
+
+@dataclass(kw_only=True)
+class Distill(Options):
+    """Train a network that predicts semantics from raw Gaussians, on scenes that semantics were lifted for.
+
+    Under torchrun several processes share the scenes of a step. A run that was interrupted goes on from its state file,
+    {out}.state.pt, if it is started again with the same options.
+    """
+
+    scenes: tyro.conf.Positional[list[Path]]
+    """Scenes {name}.ply with {name}.safetensors beside each, which `sgwarp lift` wrote; or folders of them."""
+
+    out: Path
+    """Network to write, .safetensors; its curves and run.json go beside it."""
+
+    validation: list[Path] | None = None
+    """Scenes to measure on and not to learn from."""
+
+    classes: str | None = None
+    """Names separated by commas, for the validation's mIoU; labels need none."""
+
+    arch: Literal["14A", "18A", "34A", "34C"] = "34A"
+    """Architecture of the MinkUNet."""
+
+    inputs: Literal["full", "xyz-rgb", "raw56"] = "full"
+    """full: opacity, colour and covariance; xyz-rgb: colour alone; raw56: the 56 numbers of a PLY file."""
+
+    voxel: float = 0.02
+    """Side of a voxel [m]."""
+
+    epochs: int = 100
+    """Times that every scene is seen."""
+
+    learning_rate: float = 1e-3
+    """Of the first epoch; it falls to 0 along a cosine."""
+
+    scenes_per_step: int = 1
+    """Scenes whose gradients are averaged before a step, over all processes."""
+
+    by_reliability: bool = False
+    """Weigh a voxel by the weight and the views behind its lifted features."""
+
+    augment: bool = True
+    """Turn, scale, mirror, bend and shift the scenes at random."""
+
+    up: Literal["x", "y", "z"] = "z"
+    """Axis that points up or down in the scenes."""
+
+    half: bool = False
+    """Multiply in bfloat16."""
+
+    seed: int = 0
+    """Of the first weights, the order of the scenes and their changes."""
+
+    checkpoint: Path | None = None
+    """Weights to start from: a network of ours, or a checkpoint of MinkowskiEngine, OpenScene or the paper."""
+
+    def run(self) -> None:
+        check_name("--out", self.out, ".safetensors")
+        from sgwarp.distill.processes import joined
+
+        log = self.start()
+        with joined(self.device) as processes:
+            from sgwarp.distill.curves import write_curves
+            from sgwarp.distill.data import scenes_in
+            from sgwarp.distill.train import distill, state_path
+            from sgwarp.network import save_network
+            from sgwarp.nn.checkpoint import read_weights
+
+            scenes, validation = scenes_in(self.scenes), scenes_in(self.validation or [])
+            settings = self._settings()
+            weights = None if self.checkpoint is None else read_weights(self.checkpoint)
+            with show_progress("distill") as progress:
+                network, history = distill(
+                    scenes,
+                    settings,
+                    validation=validation,
+                    class_vectors=self._class_vectors(scenes, log),
+                    weights=weights,
+                    state=state_path(self.out),
+                    processes=processes,
+                    device=self.device,
+                    progress=progress if processes.leads else None,
+                    log=log,
+                )
+            if not processes.leads:
+                return
+            with log.stage("write"):
+                notes = {"scenes": len(scenes), "epochs": settings.epochs, "loss": history[-1].loss}
+                save_network(network, self.out, notes)
+                curves = write_curves(history, self.out.with_suffix(""))
+            log.outputs += [str(self.out), *map(str, curves)]
+            log.write(self.out.parent)
+            print(log.summary())
+
+    def _settings(self) -> DistillSettings:
+        from sgwarp.distill.settings import DistillSettings
+        from sgwarp.nn.augment import Augmentation
+
+        return DistillSettings(
+            arch=self.arch,
+            inputs=self.inputs,
+            voxel=self.voxel,
+            epochs=self.epochs,
+            learning_rate=self.learning_rate,
+            scenes_per_step=self.scenes_per_step,
+            by_reliability=self.by_reliability,
+            augment=Augmentation(up="xyz".index(self.up)) if self.augment else None,
+            half=self.half,
+            seed=self.seed,
+        )
+
+    def _class_vectors(self, scenes: list[TrainingScene], log: RunLog) -> Tensor | None:
+        """Text vectors of the classes, in the space of the scenes' semantics."""
+        if self.classes is None:
+            return None
+        from sgwarp.commands.segment import class_names
+        from sgwarp.encoders.registry import text_encoder_for
+
+        if self.validation is None:
+            raise InputError("--classes: are for the validation; name scenes with --validation")
+        with log.stage("load_encoder"):
+            return text_encoder_for(scenes[0].load()[1].space).encode_text(class_names(self.classes))

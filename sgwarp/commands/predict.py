@@ -1,0 +1,72 @@
+"""`sgwarp predict`: semantics of a scene from its Gaussians alone."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Literal
+
+from sgwarp.commands.options import SceneOptions, check_name, load_on
+
+if TYPE_CHECKING:
+    from sgwarp.runlog import RunLog
+    from sgwarp.scene import Gaussians, Semantics
+
+
+@dataclass(kw_only=True)
+class Predict(SceneOptions):
+    """Predict the semantics of every Gaussian with a trained network; no views are needed."""
+
+    net: Path
+    """Network that `sgwarp distill` wrote, or a checkpoint of MinkowskiEngine, OpenScene or the paper."""
+
+    out: Path
+    """Semantics file to write, .safetensors; run.json goes beside it."""
+
+    projection: Path | None = None
+    """What `sgwarp lift` wrote for this scene: the network then only fills in the Gaussians that no view saw, and is
+    left out where the views cover the scene."""
+
+    always: bool = False
+    """Run the network even if the projection covers the scene."""
+
+    inputs: Literal["full", "xyz-rgb", "raw56"] | None = None
+    """Of a checkpoint, which does not say; by default those that have its number of channels."""
+
+    voxel: float | None = None
+    """Side of a voxel [m], of a checkpoint, which does not say; by default 0.02."""
+
+    space: str | None = None
+    """Embedding space of a checkpoint, which does not say; by default its file name."""
+
+    def run(self) -> None:
+        check_name("--out", self.out, ".safetensors")
+        with self.logged(self.out.parent) as log:
+            from sgwarp.io.store import save_semantics
+
+            gaussians = self.load_scene(log)
+            semantics = self._semantics(gaussians, log)
+            with log.stage("write"):
+                save_semantics(
+                    semantics, self.out, {"network": str(self.net), "projection": self.projection is not None}
+                )
+            log.outputs.append(str(self.out))
+
+    def _semantics(self, gaussians: Gaussians, log: RunLog) -> Semantics:
+        from sgwarp.ensemble import filled, projection_quality
+        from sgwarp.network import load_network
+        from sgwarp.predict import predict
+
+        projected = None
+        if self.projection is not None:
+            with log.stage("read"):
+                projected = load_on(self.projection, gaussians)
+            quality = projection_quality(projected)
+            log.error |= quality._asdict()
+            if quality.suffices() and not self.always:
+                log.leave_out("network")
+                return projected
+        with log.stage("load_network"):
+            network = load_network(self.net, inputs=self.inputs, voxel=self.voxel, space=self.space).to(self.device)
+        predicted = predict(gaussians, network, log=log).semantics()
+        return predicted if projected is None else filled(projected, predicted)

@@ -1,0 +1,1 @@
+"""Networks on sparse voxels, with the conventions and parameter names of MinkowskiEngine."""
