@@ -16,8 +16,8 @@ from sgwarp.kernels.transmittance import LaneIds, Lanes
 
 # Aligned like a float: views of a caller's tensors start anywhere.
 TYPES = """
-    using Row = float __attribute__((ext_vector_type(16), aligned(4)));
-    using Ints = int __attribute__((ext_vector_type(16), aligned(4)));
+    typedef float Row __attribute__((ext_vector_type(16), aligned(4)));
+    typedef int Ints __attribute__((ext_vector_type(16), aligned(4)));
     const Row offsets = {-7.5f, -6.5f, -5.5f, -4.5f, -3.5f, -2.5f, -1.5f, -0.5f,
                          0.5f, 1.5f, 2.5f, 3.5f, 4.5f, 5.5f, 6.5f, 7.5f};
     const Row zero = 0.0f, one = 1.0f;

@@ -7,6 +7,9 @@ from sgwarp.kernels.gaussian import EXACT_OPTIONS, Pinhole
 wp.set_module_options(EXACT_OPTIONS)
 
 
+BRIGHTEST = wp.constant(1.0e30)
+
+
 @wp.func
 def harmonics_color(sh: wp.array2d[wp.vec3], i: int, degree: int, direction: wp.vec3) -> wp.vec3:
     """Colour of Gaussian i seen along a unit direction: max(0, sum_k Y_k(direction) sh_k + 1/2)."""
@@ -28,7 +31,8 @@ def harmonics_color(sh: wp.array2d[wp.vec3], i: int, degree: int, direction: wp.
         color += 0.3731763325901154 * z * (5.0 * z * z - 3.0) * sh[i, 12]
         color += 1.445305721320277 * z * (x * x - y * y) * sh[i, 14]
     color += wp.vec3(0.5, 0.5, 0.5)
-    return wp.max(color, wp.vec3(0.0, 0.0, 0.0))
+    # Coefficients near the end of float32 overflow: an infinite colour would be NaN where its weight is zero.
+    return wp.min(wp.max(color, wp.vec3(0.0, 0.0, 0.0)), wp.vec3(BRIGHTEST, BRIGHTEST, BRIGHTEST))
 
 
 @wp.kernel

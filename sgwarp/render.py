@@ -13,6 +13,12 @@ from sgwarp.ops.settings import RasterSettings
 from sgwarp.runlog import RunLog
 from sgwarp.scene import Camera, Gaussians
 
+NOT_NEEDED = {
+    "harmonics": "harmonics_per_gaussian_that_are_zero",
+    "colors": "colour_channels_not_asked_for",
+    "depth": "depth_images_not_asked_for",
+    "record": "images_that_only_gradients_need",
+}
 RenderMode = Literal["rgb", "depth", "expected_depth", "alpha", "features"]
 
 
@@ -25,7 +31,7 @@ def render(
     settings: RasterSettings | None = None,
     log: RunLog | None = None,
 ) -> Tensor:
-    """Render one image.
+    """Render one image, without gradients; `sg.rasterize` has them.
 
     Args:
         gaussians: The scene.
@@ -36,18 +42,13 @@ def render(
         features: One row per Gaussian, float32 [N, C]; only for mode "features".
         background: What shows where the scene is transparent, one value per channel, [C]; zero if None.
         settings: Thresholds of the rasterizer.
-        log: Counts the Gaussians that were left out, by reason, as `culled_...`, and what the plan left out, as
-            `..._not_needed`.
+        log: Counts the Gaussians that were left out, by reason, as `culled_...`, and what the plan left out.
 
     Raises:
         InputError: Unknown mode, or features missing where they are needed or given where they are not.
     """
     if not isinstance(camera, Camera):
         raise InputError(f"camera: expected a Camera, got {type(camera).__name__}; a view has one: view.camera")
-    if mode not in get_args(RenderMode):
-        raise InputError(f"mode: '{mode}' is not one of {', '.join(get_args(RenderMode))}")
-    if (mode == "features") != (features is not None):
-        raise InputError(f"mode '{mode}': features [N, C] belong to mode 'features', and only to it")
     settings = settings or RasterSettings()
     chosen = plan(gaussians, mode, features=features, settings=settings)
     rendering = rasterize(
@@ -64,7 +65,7 @@ def render(
         for reason, count in rendering.culled.items():
             log.leave_out(f"culled_{reason}", count)
         for what, amount in chosen.left_out:
-            log.leave_out(f"{what}_not_needed", amount)
+            log.leave_out(NOT_NEEDED[what], amount)
     image = rendering.features if chosen.values != "nothing" else getattr(rendering, mode)
     assert isinstance(image, Tensor)
     return image
@@ -80,7 +81,16 @@ def plan(
 
     Args:
         gaussians, mode, features, settings: As for `render`.
+
+    Raises:
+        InputError: Unknown mode, or features missing where they are needed or given where they are not.
     """
+    if mode not in get_args(RenderMode):
+        raise InputError(f"mode: '{mode}' is not one of {', '.join(get_args(RenderMode))}")
+    if (mode == "features") != (features is not None):
+        raise InputError(f"mode '{mode}': features [N, C] belong to mode 'features', and only to it")
+    if features is not None and features.ndim != 2:
+        raise InputError(f"features: expected shape [{len(gaussians)}, C], got {list(features.shape)}")
     values: Values = "colors" if mode == "rgb" else "features" if mode == "features" else "nothing"
     return plan_render(
         gaussians,

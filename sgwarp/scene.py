@@ -10,7 +10,6 @@ import hashlib
 import math
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
-from functools import cached_property
 from pathlib import Path
 from typing import Any
 
@@ -35,6 +34,11 @@ def _float32(name: str, value: Any, shape: tuple[int | None, ...]) -> Tensor:
     wanted = ", ".join("any" if s is None else str(s) for s in shape)
     _require(fits, f"{name}: expected shape [{wanted}], got {list(tensor.shape)}")
     return tensor.to(torch.float32).contiguous()
+
+
+def _version(*tensors: Tensor) -> tuple[int, ...]:
+    """Changes whenever one of the tensors is written to in place."""
+    return tuple(0 if tensor.is_inference() else tensor._version for tensor in tensors)
 
 
 def _first_bad(name: str, bad: Tensor, rule: str, values: Tensor) -> None:
@@ -105,9 +109,22 @@ class Gaussians:
     def sh_degree(self) -> int:
         return math.isqrt(self.sh.shape[1]) - 1
 
-    @cached_property
+    def _known(self, name: str, tensors: tuple[Tensor, ...], find: Callable[[], Any]) -> Any:
+        """What `find` says of the tensors, remembered until one of them is written to."""
+        version = _version(*tensors)
+        known = self.__dict__.get(f"_{name}")
+        if known is None or known[0] != version:
+            known = (version, find())
+            object.__setattr__(self, f"_{name}", known)
+        return known[1]
+
+    @property
     def used_sh_degree(self) -> int:
         """Highest degree with a coefficient that is not zero."""
+        degree: int = self._known("used_sh_degree", (self.sh,), self._find_used_sh_degree)
+        return degree
+
+    def _find_used_sh_degree(self) -> int:
         for degree in range(self.sh_degree, 0, -1):
             part = self.sh.detach()[:, degree * degree : (degree + 1) ** 2]
             # A few rows mostly decide it; all are read only where these are zero.
@@ -115,25 +132,38 @@ class Gaussians:
                 return degree
         return 0
 
-    @cached_property
+    @property
     def finite(self) -> Tensor:
         """Rows whose every field is finite, bool [N]."""
+        fields = (self.means, self.quats, self.scales, self.opacities, self.sh)
+        rows: Tensor = self._known("finite", fields, self._find_finite)
+        return rows
+
+    def _find_finite(self) -> Tensor:
         flat = (self.means, self.quats, self.scales, self.opacities[:, None], self.sh.flatten(1))
         return torch.stack([torch.isfinite(f).all(dim=1) for f in flat]).all(dim=0)
 
-    @cached_property
+    @property
     def colors_may_be_non_finite(self) -> bool:
         """Whether some colour coefficient might hold NaN or infinity; one sum over them tells, in one pass."""
-        return not bool(torch.isfinite(self.sh.detach().sum()))
+        may_be: bool = self._known(
+            "colors_may_be_non_finite", (self.sh,), lambda: not bool(torch.isfinite(self.sh.detach().sum()))
+        )
+        return may_be
 
     @property
     def non_finite(self) -> int:
         """How many rows hold NaN or infinity; the renderer leaves them out."""
         return len(self) - int(self.finite.sum())
 
-    @cached_property
+    @property
     def fingerprint(self) -> str:
         """Hash of geometry and order, 16 hex digits: features belong to exactly one scene."""
+        fields = (self.means, self.quats, self.scales, self.opacities)
+        found: str = self._known("fingerprint", fields, self._find_fingerprint)
+        return found
+
+    def _find_fingerprint(self) -> str:
         digest = hashlib.sha256()
         for tensor in (self.means, self.quats, self.scales, self.opacities):
             digest.update(tensor.detach().cpu().numpy().tobytes())
@@ -176,8 +206,9 @@ class Camera:
 
     def __post_init__(self) -> None:
         put = object.__setattr__
-        K = torch.as_tensor(self.K, dtype=torch.float64).detach().cpu()
-        pose = torch.as_tensor(self.world_to_camera, dtype=torch.float64).detach().cpu()
+        # Copies: a caller may go on using the tensors, a rendering's backward pass still needs the camera.
+        K = torch.as_tensor(self.K, dtype=torch.float64).detach().cpu().clone()
+        pose = torch.as_tensor(self.world_to_camera, dtype=torch.float64).detach().cpu().clone()
         _require(K.shape == (3, 3), f"K: expected shape [3, 3], got {list(K.shape)}")
         _require(pose.shape == (4, 4), f"world_to_camera: expected shape [4, 4], got {list(pose.shape)}")
         _require(bool(torch.isfinite(K).all()), "K: holds NaN or infinity")
@@ -193,6 +224,8 @@ class Camera:
         _require(bool(torch.linalg.det(R) > 0), "world_to_camera: mirrors the world (determinant -1)")
         affine = torch.tensor([0.0, 0.0, 0.0, 1.0], dtype=torch.float64)
         _require(bool((pose[3] == affine).all()), "world_to_camera: last row must be [0, 0, 0, 1]")
+        whole = self.width == int(self.width) and self.height == int(self.height)
+        _require(whole, f"image size: expected whole pixels, got {self.width} x {self.height}")
         _require(self.width > 0 and self.height > 0, f"image size must be positive, got {self.width} x {self.height}")
         _require(0 < self.near < self.far, f"near: expected 0 < near < far, got {self.near} and {self.far}")
         put(self, "K", K)

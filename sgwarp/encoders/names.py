@@ -66,6 +66,8 @@ def _parse_member(text: str, whole: str) -> Member:
     weight = _WEIGHT.search(text)
     if weight:
         text = text[: weight.start()]
+    if weight and float(weight[1]) == 0:
+        raise InputError(f"encoder '{whole}': the weight after @ is a positive number, got '{weight[1]}'")
     first, *rest = _PART.split(text)
     source = parse_part(first, whole)
     if source.kind.role == "masks":

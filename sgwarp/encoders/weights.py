@@ -44,6 +44,8 @@ def load_config(path: str, what: str, types: tuple[str, ...]) -> Any:
         InputError: It cannot be had, or is of another type.
     """
     transformers = require("transformers", "models", what)
+    if path.startswith(("/", "./", "../", "~")) and not Path(path).expanduser().is_dir():
+        raise InputError(f"{what}: {path}: no such folder")
     with _loading(path, what):
         config = transformers.AutoConfig.from_pretrained(path)
     if config.model_type not in types:

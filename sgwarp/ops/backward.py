@@ -137,7 +137,7 @@ def composite_backward(
     if ordered:
         inputs = [*lists.sums(), view(rows, Lanes)]
         launch(kernels.sum_intersections, len(lists.order), inputs, [view(sums, Lanes)], device=device)
-    if gradients.surface is not None:
+    if gradients.surface is not None and count:
         # Pixels without a surface add zero to the first Gaussian: choosing the others would wait for the device.
         at_hit = torch.where(hit >= 0, gradients.surface, 0.0).flatten()
         sums[:, at_depth].index_add_(0, hit.clamp(min=0).flatten().to(torch.int64), at_hit)

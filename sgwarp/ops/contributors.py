@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from numbers import Integral
+
 import torch
 import warp as wp
 from torch import Tensor
@@ -41,7 +43,7 @@ def top_contributors(
     """
     if not isinstance(camera, Camera):
         raise InputError(f"camera: expected a Camera, got {type(camera).__name__}; a view has one: view.camera")
-    if isinstance(k, bool) or not isinstance(k, int) or k < 1:
+    if isinstance(k, bool) or not isinstance(k, Integral) or k < 1:
         raise InputError(f"k: expected a positive integer, got {k!r}")
     projected = tiles.project(gaussians, camera, settings)
     order = tiles.depth_order(projected)

@@ -12,7 +12,7 @@ from sgwarp.errors import InputError
 from sgwarp.ops import backward, tiles
 from sgwarp.ops import rasterize as forward
 from sgwarp.ops.plan import RenderPlan, plan_render
-from sgwarp.ops.rasterize import Rendering, composite_recorded, packed_colors
+from sgwarp.ops.rasterize import Rendering, composite_recorded, packed_colors, require_finite
 from sgwarp.ops.settings import RasterSettings
 from sgwarp.scene import SH_COUNTS, Camera, Gaussians
 
@@ -79,8 +79,12 @@ def rasterize(
     values = sh if features is None else features
     assert values is not None
     n = len(means)
-    if features is not None and not (features.ndim == 2 and len(features) == n and features.shape[1] > 0):
-        raise InputError(f"features: expected shape [{n}, C], got {list(features.shape)}")
+    if schedule not in (None, "lanes", "block"):
+        raise InputError(f"schedule: expected 'lanes', 'block' or None, got '{schedule}'")
+    if features is not None:
+        if not (features.ndim == 2 and len(features) == n and features.shape[1] > 0 and features.is_floating_point()):
+            raise InputError(f"features: expected floating point [{n}, C], got {features.dtype} {list(features.shape)}")
+        require_finite(features)
     if sh is not None and not (sh.ndim == 3 and sh.shape[1] in SH_COUNTS):
         raise InputError(f"sh: expected shape [{n}, 1, 4, 9 or 16, 3], got {list(sh.shape)}")
     channels = 3 if features is None else features.shape[1]

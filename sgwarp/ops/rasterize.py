@@ -76,6 +76,7 @@ def rasterize(
         ok = features.ndim == 2 and len(features) == n and features.shape[1] > 0 and features.is_floating_point()
         if not ok:
             raise InputError(f"features: expected floating point [{n}, C], got {features.dtype} {list(features.shape)}")
+        require_finite(features)
     channels = 3 if features is None else features.shape[1]
     if background is not None and tuple(background.shape) != (channels,):
         raise InputError(f"background: expected shape [{channels}], got {list(background.shape)}")
@@ -96,6 +97,19 @@ def rasterize(
     if expected_depth:
         mean_depth = torch.where(alpha > 0, depth_sum / alpha.clamp(min=1e-12), 0.0)
     return Rendering(image, alpha, mean_depth, surface if depth else None, projected.counts())
+
+
+def require_finite(features: Tensor) -> None:
+    """Refuse NaN and infinity, on the CPU; on CUDA to look at the values is to wait for the device.
+
+    Raises:
+        InputError: Some feature is not finite; it would reach pixels far from its Gaussian, as zero times infinity.
+    """
+    if not features.is_cuda and not bool(torch.isfinite(features.detach().sum(dtype=torch.float64))):
+        rows = (~torch.isfinite(features.detach())).any(dim=1).nonzero().flatten()
+        raise InputError(
+            f"features: NaN or infinity in {len(rows)} rows, the first is {int(rows[0])}; mend or drop them"
+        )
 
 
 def packed_colors(

@@ -394,3 +394,68 @@ def test_inputs_are_checked(make_scene):
         rasterize_differentiable(*inputs, sh=gaussians.sh, means2d=torch.zeros(3, 2))
     with pytest.raises(InputError, match="absgrad"):
         rasterize_differentiable(*inputs, sh=gaussians.sh, absgrad=True)
+
+
+def test_the_camera_is_the_renderings_own(make_scene):
+    """Writing to K after the forward pass changes no gradient."""
+    _, gaussians, camera = make_scene("random_cloud")
+    results = []
+    for factor in (1.0, 3.0):
+        means = gaussians.means.clone().requires_grad_()
+        K = camera.K.clone()
+        rest = (gaussians.quats, gaussians.scales, gaussians.opacities, camera.world_to_camera, K)
+        image = rasterize_differentiable(means, *rest, camera.width, camera.height, sh=gaussians.sh)
+        K *= factor
+        (image.features**2).sum().backward()
+        results.append(means.grad)
+    assert torch.equal(*results)
+
+
+def test_empty_scene_has_a_depth_to_differentiate(make_scene):
+    _, gaussians, camera = make_scene("random_cloud")
+    names = ("means", "quats", "scales", "opacities")
+    leaves = [getattr(gaussians, name)[:0].clone().requires_grad_() for name in names]
+    size = (camera.world_to_camera, camera.K, camera.width, camera.height)
+    rasterize_differentiable(*leaves, *size, sh=gaussians.sh[:0], depth=True).depth.sum().backward()
+    assert leaves[0].grad.shape == (0, 3)
+
+
+@pytest.mark.parametrize("channels", [3, 16, 32])
+def test_tensors_may_start_anywhere_in_memory(make_scene, channels):
+    """Images of whole vectors are read in place, wherever a caller's view of its memory begins."""
+    _, gaussians, camera = make_scene("random_cloud")
+    camera = camera.resized(48, 64)
+
+    def moved(tensor: Tensor, start: int) -> Tensor:
+        flat = torch.empty(tensor.numel() + start)[start:].view(tensor.shape)
+        return flat.copy_(tensor)
+
+    rng = torch.Generator().manual_seed(0)
+    features = torch.rand(len(gaussians), channels, generator=rng)
+    v_image, v_alpha = torch.rand(48, 64, channels, generator=rng), torch.rand(48, 64, generator=rng)
+    results = []
+    for start in (0, 1, 3):
+        leaves = [moved(t, start).requires_grad_() for t in (gaussians.means, features)]
+        rest = (gaussians.quats, gaussians.scales, gaussians.opacities, camera.world_to_camera, camera.K, 64, 48)
+        image = rasterize_differentiable(leaves[0], *rest, features=leaves[1])
+        torch.autograd.backward([image.features, image.alpha], [moved(v_image, start), moved(v_alpha, start)])
+        results.append([leaf.grad for leaf in leaves])
+    for other in results[1:]:
+        assert all(torch.equal(a, b) for a, b in zip(results[0], other, strict=True))
+
+
+@pytest.mark.parametrize("bad", [torch.nan, torch.inf])
+def test_features_that_are_not_finite_are_refused(make_scene, bad):
+    _, gaussians, camera = make_scene("random_cloud")
+    features = torch.ones(len(gaussians), 3)
+    features[7, 1] = bad
+    with pytest.raises(InputError, match="features: NaN or infinity in 1 rows, the first is 7"):
+        rasterize(gaussians, camera, features)
+
+
+def test_huge_coefficients_stay_finite_colours(make_scene):
+    _, gaussians, camera = make_scene("sh3")
+    sh = gaussians.sh.clone()
+    sh[7], sh[9] = 3e38, -3e38
+    spoiled = Gaussians(gaussians.means, gaussians.quats, gaussians.scales, gaussians.opacities, sh)
+    assert not bool(torch.isnan(rasterize(spoiled, camera).features).any())

@@ -89,5 +89,21 @@ def test_a_plan_says_what_it_does(make_scene):
         sg.plan(gaussians).depth = True
     log = sg.RunLog()
     sg.render(with_degree(gaussians, 2, 1), camera, log=log)
-    assert log.left_out["harmonics_not_needed"] == 5
-    assert log.left_out["depth_not_needed"] == 2
+    assert log.left_out["harmonics_per_gaussian_that_are_zero"] == 5
+    assert log.left_out["depth_images_not_asked_for"] == 2
+
+
+def test_a_scene_that_was_written_to_is_looked_at_again(make_scene):
+    _, gaussians, camera = make_scene("random_cloud")
+    gaussians = with_degree(gaussians, 3, 0)
+    assert plan_render(gaussians).sh_degree == 0
+    assert bool(gaussians.finite.all())
+    before = gaussians.fingerprint
+    gaussians.sh.copy_(with_degree(gaussians, 3, 3).sh)
+    assert plan_render(gaussians).sh_degree == 3
+    fresh = Gaussians(gaussians.means, gaussians.quats, gaussians.scales, gaussians.opacities, gaussians.sh)
+    assert torch.equal(sg.render(gaussians, camera), sg.render(fresh, camera))
+    gaussians.sh[5, 0, 0] = torch.nan
+    assert int(gaussians.finite.sum()) == len(gaussians) - 1
+    gaussians.means[0, 0] += 1.0
+    assert gaussians.fingerprint != before
