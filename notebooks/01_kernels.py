@@ -364,7 +364,8 @@ plt.show()
 # One thread walks a tile's list front to back and adds $c_i\,\alpha_i\,T_i$ to every pixel, where
 # $T_i = \prod_{j<i} (1 - \alpha_j)$ is the light that the Gaussians in front let through (eq. 1). This is the *lane*
 # schedule, made for CPUs: 16 pixels of a row are one vector. `make_composite_colors(True, False)` keeps both depths,
-# but not what training needs (`None`); `state` is scratch, one slot for each host thread.
+# but not what training needs (`None`); the rest is scratch, one slot for each host thread: the state of every row, and
+# 32 fragments at a time with the rows that they reach.
 
 
 # %%
@@ -372,7 +373,8 @@ def composite(lists):
     """Colours, transmittance, sum of alpha T z and the depth of the surface."""
     outputs = [wp.zeros((HEIGHT, WIDTH), dtype=kind) for kind in (wp.vec3, float, float, float)]
     state = wp.zeros((1, 16, 6), dtype=Lanes)
-    inputs = [0, 0, lists["offsets"], lists["listed"], lists["splats"], knobs, WIDTH, HEIGHT, state]
+    batch = [wp.zeros((1, 32), dtype=binning.Fragment), wp.zeros((1, 2, 32), dtype=int)]
+    inputs = [0, 0, lists["offsets"], lists["listed"], lists["splats"], knobs, WIDTH, HEIGHT, state, *batch]
     wp.launch(compositing_lanes.make_composite_colors(True, False), TILES, inputs, [*outputs, None, None])
     return [output.numpy() for output in outputs]
 
