@@ -1,6 +1,6 @@
 """Does the network learn what it is lifted? Procedural rooms: trained on some, measured on others.
 
-    python benchmarks/distill.py [--train 12] [--test 4] [--epochs 30] [--out benchmarks/distill.json]
+    python benchmarks/distill.py [--train 12] [--test 4] [--epochs 40] [--out benchmarks/distill.json]
 
 The stand-in for a 2D encoder sees the rooms' true pieces of furniture and names them with errors, in the words of a toy
 text space: in every view a piece is taken for something else with probability 0.25, and some pieces (0.15) are taken
@@ -102,7 +102,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--train", type=int, default=12)
     parser.add_argument("--test", type=int, default=4)
-    parser.add_argument("--epochs", type=int, default=30)
+    parser.add_argument("--epochs", type=int, default=40)
     parser.add_argument("--count", type=int, default=20_000, help="Gaussians in a room")
     parser.add_argument("--views", type=int, default=8, help="views lifted into a room")
     parser.add_argument("--voxel", type=float, default=0.1)
@@ -113,7 +113,8 @@ def main() -> None:
     rooms = [lifted_room(seed, options.count, options.views) for seed in range(options.train + options.test)]
     train, test = rooms[: options.train], rooms[options.train :]
     quality = [projection_quality(semantics) for _, semantics in test]
-    results: dict[str, object] = {name: value for name, value in vars(options).items() if name not in ("out", "inputs")}
+    results: dict[str, object] = json.loads(options.out.read_text()) if options.out.exists() else {}
+    results |= {name: value for name, value in vars(options).items() if name not in ("out", "inputs")}
     results["coverage of the test rooms"] = sum(q.coverage for q in quality) / len(quality)
     results["reliability of the test rooms"] = sum(q.reliability for q in quality) / len(quality)
     scenes = [
@@ -124,6 +125,7 @@ def main() -> None:
         arch=options.arch,
         voxel=options.voxel,
         epochs=options.epochs,
+        scenes_per_step=2,
         augment=Augmentation(up=1, elastic=()),
     )
     for inputs in options.inputs:
