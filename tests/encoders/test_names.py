@@ -61,11 +61,17 @@ def test_every_example_is_a_name(kind):
         ("files:x+graph", "'graph' does not go with 'files:x'"),
         ("conse+text:conse+graph", r"\+text:NAME goes last"),
         ("vlpart:x+text:", r"\+text:NAME goes last"),
+        ("conse@0", "the weight after @ is a positive number, got '0'"),
     ],
 )
 def test_names_that_do_not_fit(name, message):
     with pytest.raises(InputError, match=message):
         parse(name)
+
+
+def test_a_folder_that_is_not_there_is_no_name_on_the_hub(tmp_path):
+    with pytest.raises(InputError, match="nowhere: no such folder"):
+        make_encoder(f"clip:{tmp_path / 'nowhere'}")
 
 
 def test_rules_follow_from_the_parts(joint_models, sam_models, tmp_path):
