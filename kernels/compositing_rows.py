@@ -1,8 +1,8 @@
 """Innermost loops of the lane schedule, forward and backward, in C++ with the compiler's vector types.
 
 Warp builds these snippets into its CPU kernels as they stand. Written in Warp, what a loop carries from one step to the
-next would go through memory; here it stays in registers, which takes about a quarter off compositing and a sixth off its
-backward pass. The arithmetic is that of `transmittance.py`, and the tests hold both to the same oracle.
+next would go through memory; here it stays in registers, which takes about a quarter off compositing and a sixth off
+its backward pass. The arithmetic is that of `transmittance.py`, and the tests hold both to the same oracle.
 """
 
 from functools import cache
