@@ -173,7 +173,7 @@ def spconv_layer(kind: str, weight: torch.Tensor, side: int):
     """A layer of spconv with our weight; its own order of axes is z, y, x."""
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")  # its build tools use what Python deprecates
-        spconv = pytest.importorskip("spconv.pytorch", reason="spconv is not installed; pip install 'sgwarp[oracles]'")
+        spconv = pytest.importorskip("spconv.pytorch", reason="spconv is not installed; pip install 'sgwarp[spconv]'")
     channels = weight.shape[1:]
     options = {"stride": 2} if kind == "SparseConv3d" else {}
     layer = getattr(spconv, kind)(*channels, side, bias=False, indice_key="map", algo=spconv.ConvAlgo.Native, **options)
