@@ -9,9 +9,10 @@ from functools import cache
 
 import warp as wp
 
-from sgwarp.kernels.binning import TILE, Fragment, fragment_of
+from sgwarp.kernels.binning import TILE, Fragment
 from sgwarp.kernels.compositing_rows import gather_batch, row_walk, write_row
 from sgwarp.kernels.gaussian import Splat
+from sgwarp.kernels.native import Seen
 from sgwarp.kernels.projection import Knobs
 from sgwarp.kernels.transmittance import (
     HALF_ROW,
@@ -37,16 +38,6 @@ def open_lanes(x: int, width: int) -> Lanes:
     for i in range(LANES):
         T[i] = wp.where(x + i < width, 1.0, 0.0)
     return T
-
-
-@wp.func
-def row_is_reached(f: Fragment, row: int, knobs: Knobs) -> bool:
-    """Whether the footprint touches any of the row's 16 pixel centres."""
-    dy = float(row) - f.y
-    v = f.c * dy
-    middle = f.b * dy + f.a * (HALF_ROW - f.x)
-    nearest = wp.max(wp.abs(middle) - HALF_ROW * f.a, 0.0)
-    return nearest * nearest + v * v <= f.level - knobs.alpha_min_level
 
 
 @wp.func
@@ -119,8 +110,8 @@ def color_walk(depth: bool, record: bool) -> wp.Function:
         width: int,
         height: int,
         state: wp.array3d[Lanes],
-        batch: wp.array2d[Fragment],
-        reached: wp.array3d[int],
+        batch: wp.array2d[Seen],
+        reached: wp.array2d[int],
     ):
         columns = (width + TILE - 1) / TILE
         x0 = (tile % columns) * TILE
@@ -137,7 +128,7 @@ def color_walk(depth: bool, record: bool) -> wp.Function:
         first = offsets[tile]
         stop = offsets[tile + 1]
         for start in range(first, stop, BATCH):
-            gather_batch(slot, start, stop, x0, y0, listed, splats, batch, reached)
+            gather_batch(slot, start, stop, x0, y0, listed, splats, knobs, batch, reached)
             for row in range(TILE):
                 if (open_rows >> row) & 1 != 0:  # noqa: SIM102 - Warp evaluates both sides of an `and`
                     if not composite_row(slot, row, start - first, batch, reached, knobs, state):
@@ -151,15 +142,6 @@ def color_walk(depth: bool, record: bool) -> wp.Function:
 def color_planes(depth: bool, record: bool) -> int:
     """Scratch vectors per row that compositing colours needs."""
     return (6 if depth else 4) + int(record)
-
-
-@wp.func
-def latest(w: Lanes, k: float, last: Lanes) -> Lanes:
-    """k in the lanes to which its fragment contributes. Floats count exactly to 2^24 places of one tile."""
-    newest = last
-    for i in range(LANES):
-        newest[i] = wp.where(w[i] > 0.0, k, last[i])
-    return newest
 
 
 @wp.func
@@ -203,8 +185,8 @@ def make_composite_colors(depth: bool, record: bool) -> wp.Kernel:
         width: int,  # [pixels]
         height: int,
         state: wp.array3d[Lanes],  # [slots, 16, planes] scratch
-        batch: wp.array2d[Fragment],  # [slots, BATCH] scratch
-        reached: wp.array3d[int],  # [slots, 2, BATCH] scratch: first and last row of each
+        batch: wp.array2d[Seen],  # [slots, BATCH] scratch
+        reached: wp.array2d[int],  # [slots, 16] scratch: the rows that each of them reaches
         # Out:
         colors_out: wp.array2d[wp.vec3],  # [H, W] sum of alpha T color
         transmittance_out: wp.array2d[float],  # [H, W]
@@ -242,166 +224,3 @@ def make_composite_colors(depth: bool, record: bool) -> wp.Kernel:
                     surface_out[y0 + row, x0 + i] = d
 
     return composite_colors
-
-
-PASS = 16  # channels accumulated in registers at a time
-Accumulator = wp.types.matrix(shape=(PASS, LANES), dtype=wp.float32)
-
-
-@wp.func
-def add_products(
-    weights: wp.array3d[Lanes],
-    owners: wp.array3d[int],
-    slot: int,
-    row: int,
-    count: int,
-    features: wp.array3d[Lanes],
-    s: int,
-    state: wp.array3d[Lanes],
-    plane: int,
-):
-    """Add sum_b w_b x_b for 16 channels of a row: one register per channel, one load per weight."""
-    acc = Accumulator()
-    for c in range(PASS):
-        acc[c] = state[slot, row, plane + c]
-    for b in range(count):
-        w = weights[slot, row, b]
-        x = features[owners[slot, row, b], s, 0]
-        for c in range(PASS):
-            acc[c] = acc[c] + w * x[c]
-    for c in range(PASS):
-        state[slot, row, plane + c] = acc[c]
-
-
-@cache
-def feature_walk(slices: int, record: bool) -> wp.Function:
-    """Device function that composites 16 `slices` channels of a tile into its scratch.
-
-    Planes of the scratch: transmittance, the channels, with `record` the last contributor.
-    """
-    last_plane = 1 + PASS * slices
-
-    @wp.func
-    def walk(
-        tile: int,
-        slot: int,
-        offsets: wp.array[int],
-        listed: wp.array[int],
-        splats: wp.array[Splat],
-        features: wp.array3d[Lanes],
-        first_slice: int,
-        knobs: Knobs,
-        width: int,
-        height: int,
-        state: wp.array3d[Lanes],
-        weights: wp.array3d[Lanes],
-        owners: wp.array3d[int],
-    ):
-        columns = (width + TILE - 1) / TILE
-        x0 = (tile % columns) * TILE
-        y0 = (tile / columns) * TILE
-        rows = wp.min(TILE, height - y0)
-        for row in range(rows):
-            state[slot, row, 0] = open_lanes(x0, width)
-            for plane in range(1, wp.static(1 + PASS * slices)):
-                state[slot, row, plane] = Lanes(0.0)
-            if wp.static(record):
-                state[slot, row, last_plane] = Lanes(-1.0)
-        open_rows = open_row_mask(y0, height)
-        first = offsets[tile]
-        stop = offsets[tile + 1]
-        for start in range(first, stop, BATCH):
-            end = wp.min(start + BATCH, stop)
-            for row in range(rows):
-                if (open_rows >> row) & 1 != 0:
-                    count = int(0)
-                    T = state[slot, row, 0]
-                    for k in range(start, end):
-                        f = fragment_of(splats, listed[k], x0, y0)
-                        if row_is_reached(f, row, knobs):
-                            alphas = lane_alphas(f, row, knobs)
-                            w = lane_contributions(alphas, T, knobs)
-                            weights[slot, row, count] = w
-                            owners[slot, row, count] = f.gaussian
-                            T = lane_attenuated(alphas, T, knobs)
-                            count += 1
-                            if wp.static(record):
-                                state[slot, row, last_plane] = latest(w, float(k - first), state[slot, row, last_plane])
-                    state[slot, row, 0] = T
-                    for s in range(wp.static(slices)):
-                        add_products(weights, owners, slot, row, count, features, first_slice + s, state, 1 + PASS * s)
-            open_rows = still_open(open_rows, state, slot)
-            if open_rows == 0:
-                break
-
-    return walk
-
-
-@cache
-def feature_writer(slices: int) -> wp.Function:
-    """Device function that writes what `feature_walk` left in the scratch."""
-
-    @wp.func
-    def write(
-        slot: int,
-        x0: int,
-        y0: int,
-        first_slice: int,
-        width: int,
-        height: int,
-        state: wp.array3d[Lanes],
-        features_out: wp.array3d[float],
-        transmittance_out: wp.array2d[float],
-    ):
-        inside = wp.min(LANES, width - x0)
-        channels = features_out.shape[2]
-        for row in range(wp.min(TILE, height - y0)):
-            T = state[slot, row, 0]
-            for i in range(inside):
-                transmittance_out[y0 + row, x0 + i] = wp.abs(T[i])
-            for c in range(wp.min(wp.static(PASS * slices), channels - PASS * first_slice)):
-                values = state[slot, row, 1 + c]
-                for i in range(inside):
-                    features_out[y0 + row, x0 + i, PASS * first_slice + c] = values[i]
-
-    return write
-
-
-@cache
-def make_composite_features(slices: int, record: bool) -> wp.Kernel:
-    """Kernel that composites passes of `16 slices` channels; with `record` also what the backward pass starts from."""
-    walk = feature_walk(slices, record)
-    write = feature_writer(slices)
-
-    @wp.kernel(module="unique", module_options=LANE_OPTIONS, enable_backward=False)
-    def composite_features(
-        # In:
-        base: int,
-        slot: int,
-        offsets: wp.array[int],  # [tiles + 1]
-        listed: wp.array[int],  # [I]
-        splats: wp.array[Splat],  # [V]
-        features: wp.array3d[Lanes],  # [N, S, 1] channels in slices of 16
-        first_slice: int,  # of this pass
-        knobs: Knobs,
-        width: int,
-        height: int,
-        state: wp.array3d[Lanes],  # [slots, 16, 1 + 16 slices (+ 1)] scratch
-        weights: wp.array3d[Lanes],  # [slots, 16, BATCH] scratch
-        owners: wp.array3d[int],  # [slots, 16, BATCH] scratch
-        # Out:
-        features_out: wp.array3d[float],  # [H, W, C] sum of alpha T x
-        transmittance_out: wp.array2d[float],  # [H, W]
-        last_out: wp.array2d[int],  # [H, W] last contributor, counted from its tile's first, -1 = none (record)
-    ):
-        """Paper eq. 1 for any number of channels."""
-        tile = base + wp.tid()
-        columns = (width + TILE - 1) / TILE
-        x0 = (tile % columns) * TILE
-        y0 = (tile / columns) * TILE
-        walk(tile, slot, offsets, listed, splats, features, first_slice, knobs, width, height, state, weights, owners)
-        write(slot, x0, y0, first_slice, width, height, state, features_out, transmittance_out)
-        if wp.static(record):
-            write_last(slot, x0, y0, width, height, state, wp.static(1 + PASS * slices), last_out)
-
-    return composite_features

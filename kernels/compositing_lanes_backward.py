@@ -21,7 +21,7 @@ from functools import cache
 
 import warp as wp
 
-from sgwarp.kernels.binning import AHEAD, TILE, fragment_of, prefetch
+from sgwarp.kernels.binning import AHEAD, TILE, prefetch
 from sgwarp.kernels.compositing_rows import fragment_replay
 from sgwarp.kernels.gaussian import Splat
 from sgwarp.kernels.projection import Knobs
@@ -95,7 +95,9 @@ def make_composite_backward(wide: bool, depth: bool, absolute: bool) -> wp.Kerne
             order = tile_reach - done  # counted from the tile's first, as all orders here
             k = first + order
             prefetch(splats, listed[first + wp.max(order - AHEAD, 0)])
-            f = fragment_of(splats, listed[k], x0, y0)
-            replay_fragment(slot, k, order, column, y0, f, features, last, gradient, knobs, state, reach, rows_out)
+            rank = listed[k]
+            replay_fragment(
+                slot, rank, k, order, column, x0, y0, splats, features, last, gradient, knobs, state, reach, rows_out
+            )
 
     return composite_backward

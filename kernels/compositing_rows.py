@@ -1,78 +1,40 @@
-"""Innermost loops of the lane schedule, forward and backward, in C++ with the compiler's vector types.
-
-Warp builds these snippets into its CPU kernels as they stand. Written in Warp, what a loop carries from one step to the
-next would go through memory; here it stays in registers, which takes about a quarter off compositing and a sixth off
-its backward pass. The arithmetic is that of `transmittance.py`, and the tests hold both to the same oracle.
-"""
+"""Innermost loops of compositing colours and of the backward pass, lane schedule, in C++ (`native.py`)."""
 
 from functools import cache
 
 import warp as wp
 
-from sgwarp.kernels.binning import AHEAD, Fragment
+from sgwarp.kernels.binning import AHEAD
 from sgwarp.kernels.gaussian import Splat
+from sgwarp.kernels.native import Seen, snippet
 from sgwarp.kernels.projection import Knobs
 from sgwarp.kernels.transmittance import LaneIds, Lanes
 
-# Aligned like a float: views of a caller's tensors start anywhere.
-TYPES = """
-    typedef float Row __attribute__((ext_vector_type(16), aligned(4)));
-    typedef int Ints __attribute__((ext_vector_type(16), aligned(4)));
-    const Row offsets = {-7.5f, -6.5f, -5.5f, -4.5f, -3.5f, -2.5f, -1.5f, -0.5f,
-                         0.5f, 1.5f, 2.5f, 3.5f, 4.5f, 5.5f, 6.5f, 7.5f};
-    const Row zero = 0.0f, one = 1.0f;
-"""
-
-# Opacity of fragment f at the 16 pixels of a row: `alpha_from_level` and `exp2_falling`.
-ALPHA = """
-        const float at = row, dy = at - f.y, v = f.c * dy;
-        const Row u = offsets * f.a + (f.b * dy + f.a * (7.5f - f.x));
-        const Row level = (f.level - v * v) - u * u;
-        const Row t = level * 0.0625f;
-        Row p = 1.2747483491e-03f + t * 1.0902324732e-04f;
-        p = 9.5791797294e-03f + t * p;
-        p = 5.5490757104e-02f + t * p;
-        p = 2.4022436783e-01f + t * p;
-        p = 6.9314706433e-01f + t * p;
-        p = 1.0f + t * p;
-        p = p * p;
-        p = p * p;
-        p = p * p;
-        p = p * p;
-        Row alpha = level < knobs.alpha_min_level ? zero : __builtin_elementwise_min(p, one * knobs.alpha_max);
-"""
-
-# Fragments of a batch, and which rows of the tile each reaches: `fragment_of` and `row_range`, 16 at a time.
+# The splats of a batch as the tile sees them; rows_of[b] has a bit for each row that splat b reaches.
 GATHER = """
-    for (int half = 0; half < 32; half += 16) {
-        Row x, y, a, b, c, inv_bc, half_width;
-        for (int i = 0; i < 16; ++i) {
-            const int k = start + half + i < stop ? start + half + i : stop - 1;
-            __builtin_prefetch(splats.data + listed.data[k + AHEAD < stop ? k + AHEAD : stop - 1]);
-            const auto& s = splats.data[listed.data[k]];
-            auto& f = batch.data[slot * 32 + half + i];
-            const float left = x0, top = y0;
-            f.x = s.mean[0] - left - 0.5f, f.y = s.mean[1] - top - 0.5f;
-            f.a = s.a, f.b = s.b, f.c = s.c, f.level = s.level, f.depth = s.depth, f.color = s.color;
-            x[i] = f.x, y[i] = f.y, a[i] = s.a, b[i] = s.b, c[i] = s.c;
-            inv_bc[i] = s.inv_bc, half_width[i] = s.half_width;
-        }
-        const Row lo = __builtin_elementwise_max(-x, -half_width);
-        const Row hi = __builtin_elementwise_min(15.0f - x, half_width);
-        const Row summit = -half_width * b * inv_bc, unit = a * inv_bc * inv_bc, w2 = half_width * half_width;
-        const Row below = __builtin_elementwise_min(__builtin_elementwise_max(summit, lo), hi);
-        const Row above = __builtin_elementwise_min(__builtin_elementwise_max(-summit, lo), hi);
-        const Row down = c * __builtin_elementwise_sqrt(__builtin_elementwise_max(w2 - below * below, zero));
-        const Row up = c * __builtin_elementwise_sqrt(__builtin_elementwise_max(w2 - above * above, zero));
-        const Row last = y + (down - b * below) * unit, first = y - (up + b * above) * unit;
-        const Row top_row = __builtin_elementwise_min(__builtin_elementwise_max(first, zero), one * 16.0f);
-        const Row bottom_row = __builtin_elementwise_min(__builtin_elementwise_max(last, -one), one * 15.0f);
-        Ints* const rows = reinterpret_cast<Ints*>(reached.data + slot * 64 + half);
-        rows[0] = __builtin_convertvector(__builtin_elementwise_ceil(top_row), Ints);
-        rows[2] = __builtin_convertvector(__builtin_elementwise_floor(bottom_row), Ints);
-        for (int i = 0; i < 16; ++i)
-            if (start + half + i >= stop) reached.data[slot * 64 + 32 + half + i] = -1;  // beyond the list
+    unsigned short* const rows_of = reinterpret_cast<unsigned short*>(reached.data + slot * 16);
+    const int count = stop - start < 32 ? stop - start : 32;
+    for (int b = 0; b < count; ++b) {
+        const int ahead = start + b + AHEAD;
+        __builtin_prefetch(splats.data + listed.data[ahead < stop ? ahead : stop - 1]);
+        const auto& s = splats.data[listed.data[start + b]];
+        auto& seen = batch.data[slot * 32 + b];
+        Row middle, top;
+        rows_of[b] = see(s, x0, y0, knobs, middle, top);
+        reinterpret_cast<Row&>(seen.middle) = middle;
+        reinterpret_cast<Row&>(seen.top) = top;
+        reinterpret_cast<Row&>(seen.splat) = reinterpret_cast<const Row&>(s);
     }
+    for (int b = count; b < 32; ++b) rows_of[b] = 0;
+"""
+
+# Bit b: splat b of the batch reaches the row.
+REACHING = """
+    typedef unsigned short Shorts __attribute__((ext_vector_type(32), aligned(4)));
+    using Bits = bool __attribute__((ext_vector_type(32)));
+    const Shorts rows_of = *reinterpret_cast<const Shorts*>(reached.data + slot * 16);
+    const Shorts here = rows_of & (unsigned short)(1 << row);
+    unsigned left = __builtin_bit_cast(unsigned, __builtin_convertvector(here != (unsigned short)0, Bits));
 """
 
 # A row of the scratch as pixels of the image.
@@ -88,34 +50,32 @@ WRITE = """
     }
 """
 
-FORWARD = """
+FORWARD = (
+    REACHING
+    + """
+    if (!left) return true;
     const int planes = state.shape[2];
     Row* const row_state = reinterpret_cast<Row*>(state.data + (slot * 16 + row) * planes);
-    // Bit b: fragment b of the batch reaches the row.
-    using Bits = bool __attribute__((ext_vector_type(16)));
-    const Ints* const limits = reinterpret_cast<const Ints*>(reached.data + slot * 64);
-    const Bits low = __builtin_convertvector(limits[0] <= row & limits[2] >= row, Bits);
-    const Bits high = __builtin_convertvector(limits[1] <= row & limits[3] >= row, Bits);
-    unsigned left = __builtin_bit_cast(unsigned short, low) | unsigned(__builtin_bit_cast(unsigned short, high)) << 16;
-    if (!left) return true;
     Row T = row_state[0], red = row_state[1], green = row_state[2], blue = row_state[3];
     Row z = zero, surface = zero, last = zero;
     if (DEPTH) z = row_state[4], surface = row_state[5];
     if (RECORD) last = row_state[planes - 1];
     for (; left; left &= left - 1) {
         const int b = __builtin_ctz(left);
-        const auto& f = batch.data[slot * 32 + b];
-        ALPHA
-        const Row weight = alpha * T, behind = T - weight;
+        const auto& seen = batch.data[slot * 32 + b];
+        const auto& s = seen.splat;
+        const float middle = reinterpret_cast<const float*>(&seen.middle)[row];
+        const float top = reinterpret_cast<const float*>(&seen.top)[row];
+        const Row weight = opacity(offsets * s.a + middle, top, knobs) * T, behind = T - weight;
         const Row w = behind > knobs.transmittance_min ? weight : zero;
-        red += w * f.color[0];
-        green += w * f.color[1];
-        blue += w * f.color[2];
+        red += w * s.color[0];
+        green += w * s.color[1];
+        blue += w * s.color[2];
         const float place = order + b;
         if (RECORD) last = w > zero ? one * place : last;
         if (DEPTH) {
-            z += w * f.depth;
-            const Row here = T - w <= knobs.surface_transmittance ? one * (RECORD ? place : f.depth) : surface;
+            z += w * s.depth;
+            const Row here = T - w <= knobs.surface_transmittance ? one * (RECORD ? place : s.depth) : surface;
             surface = T > knobs.surface_transmittance ? here : surface;
         }
         T = behind > knobs.transmittance_min ? behind : -__builtin_elementwise_abs(T);
@@ -123,42 +83,71 @@ FORWARD = """
     row_state[0] = T, row_state[1] = red, row_state[2] = green, row_state[3] = blue;
     if (DEPTH) row_state[4] = z, row_state[5] = surface;
     if (RECORD) row_state[planes - 1] = last;
-    return __builtin_reduce_max(T) > 0.0f;
+    return bits(T > zero) != 0;
+"""
+)
+
+# The value of a splat at each of its rows: its features under the image's gradient, four rows at a time.
+VALUES = """
+    Row values[16];
+    const int slices = features.shape[1];
+    const float* const x = reinterpret_cast<const float*>(features.data + s.gaussian * slices);
+    for (unsigned rest = left; rest;) {
+        const Row* v_rows[4];
+        int of[4];
+        for (int j = 0; j < 4; ++j) {
+            of[j] = rest ? __builtin_ctz(rest) : of[j - 1];
+            rest &= rest - 1;
+            v_rows[j] = reinterpret_cast<const Row*>(gradient.data + ((y0 + of[j]) * columns + column) * planes);
+        }
+        Row a = zero, b = zero, c = zero, d = zero;
+        for (int i = 0; i < 16 * slices; ++i) {
+            const float xi = x[i];
+            a += xi * v_rows[0][i], b += xi * v_rows[1][i], c += xi * v_rows[2][i], d += xi * v_rows[3][i];
+        }
+        values[of[0]] = a, values[of[1]] = b, values[of[2]] = c, values[of[3]] = d;
+    }
 """
 
 BACKWARD = """
     const int columns = last.shape[1], planes = gradient.shape[2];
-    const int middle_row = (f.first_row + f.last_row) / 2;
+    const auto& s = splats.data[rank];
+    Row middles, tops;
+    const Ints row_ends = *reinterpret_cast<const Ints*>(reach.data + slot * 16);
+    const unsigned left = see(s, x0, y0, knobs, middles, tops) & bits(row_ends >= order);
+    if (!left) {
+        *reinterpret_cast<Row*>(rows.data + place) = zero;
+        return;
+    }
+    float middle_of[16] __attribute__((aligned(64))), top_of[16] __attribute__((aligned(64)));
+    *reinterpret_cast<Row*>(middle_of) = middles, *reinterpret_cast<Row*>(top_of) = tops;
+    const float above = y0, y = s.mean[1] - above - 0.5f;
+    const int middle_row = (__builtin_ctz(left) + 31 - __builtin_clz(left)) / 2;
+#if WIDE
+    VALUES
+#endif
     Row g0 = zero, g1 = zero, g2 = zero, red = zero, green = zero, blue = zero, z = zero, across = zero, down = zero;
-    for (int row = f.first_row; row <= f.last_row; ++row) {
-        if (order > reach.data[slot * 16 + row]) continue;
+    for (unsigned rest = left; rest; rest &= rest - 1) {
+        const int row = __builtin_ctz(rest);
         const int pixels = (y0 + row) * columns + column;
         const Row* const v_row = reinterpret_cast<const Row*>(gradient.data + pixels * planes);
         Row* const row_state = reinterpret_cast<Row*>(state.data + (slot * 16 + row) * 2);
-        ALPHA
+        const Row u = offsets * s.a + middle_of[row];
+        Row alpha = opacity(u, top_of[row], knobs);
         alpha = *reinterpret_cast<const Ints*>(last.data + pixels) >= order ? alpha : zero;
-        const Row T = row_state[0] / __builtin_elementwise_max(one - alpha, one * MIN_PASSED);
+        const Row T = row_state[0] * reciprocal(__builtin_elementwise_max(one - alpha, one * MIN_PASSED));
         const Row w = alpha * T;
         Row value = zero;
-        if (WIDE) {
-            Row odd = zero;  // two sums in turn: one alone would wait for its own last addition
-            const int slices = features.shape[1];
-            for (int s = 0; s < slices; ++s) {
-                const auto& x = features.data[f.gaussian * slices + s];
-                for (int c = 0; c < 16; c += 2) {
-                    value += x[c] * v_row[16 * s + c];
-                    odd += x[c + 1] * v_row[16 * s + c + 1];
-                }
-            }
-            value += odd;
-        } else {
-            value = f.color[0] * v_row[0] + f.color[1] * v_row[1] + f.color[2] * v_row[2];
-            red += w * v_row[0];
-            green += w * v_row[1];
-            blue += w * v_row[2];
-        }
+#if WIDE
+        value = values[row];
+#else
+        value = s.color[0] * v_row[0] + s.color[1] * v_row[1] + s.color[2] * v_row[2];
+        red += w * v_row[0];
+        green += w * v_row[1];
+        blue += w * v_row[2];
+#endif
         if (DEPTH) {
-            value += f.depth * v_row[planes - 1];
+            value += s.depth * v_row[planes - 1];
             z += w * v_row[planes - 1];
         }
         const Row excess = value - row_state[1];
@@ -170,14 +159,15 @@ BACKWARD = """
         g1 += d * g;
         g2 += (d * d) * g;
         if (ABSOLUTE) {
-            across += __builtin_elementwise_abs(f.a * u * g);
-            down += __builtin_elementwise_abs((f.b * u + f.c * v) * g);
+            const float v = s.c * (row - y);
+            across += __builtin_elementwise_abs(s.a * u * g);
+            down += __builtin_elementwise_abs((s.b * u + s.c * v) * g);
         }
     }
-    const float middle = middle_row, v = f.c * (middle - f.y);
-    const Row u = offsets * f.a + (f.b * (middle - f.y) + f.a * (7.5f - f.x));
-    const Row gu = u * g0 + f.b * g1, gv = v * g0 + f.c * g1, gu1 = u * g1 + f.b * g2;
-    Row sums[12] = {g0, gu, gv, u * gu + f.b * gu1, v * gu + f.c * gu1, v * gv + f.c * (v * g1 + f.c * g2)};
+    const float v = s.c * (middle_row - y);
+    const Row u = offsets * s.a + middle_of[middle_row];
+    const Row gu = u * g0 + s.b * g1, gv = v * g0 + s.c * g1, gu1 = u * g1 + s.b * g2;
+    Row sums[12] = {g0, gu, gv, u * gu + s.b * gu1, v * gu + s.c * gu1, v * gv + s.c * (v * g1 + s.c * g2)};
     int next = 6;
     if (!WIDE) sums[6] = red, sums[7] = green, sums[8] = blue, next = 9;
     if (DEPTH) sums[next++] = z;
@@ -196,15 +186,7 @@ BACKWARD = """
     const Row q0 = FOLD_4(p0, p1), q1 = FOLD_4(p2, p3), q2 = FOLD_4(p4, p5);
     const Row r0 = FOLD_2(q0, q1), r1 = FOLD_2(q2, zero);
     *reinterpret_cast<Row*>(rows.data + place) = FOLD_1(r0, r1);
-"""
-
-
-def snippet(body: str, **constants: object) -> str:
-    """The C++ of a loop, with its options filled in; what they switch off the compiler removes."""
-    body = TYPES + body.replace("ALPHA\n", ALPHA)
-    for name, value in constants.items():
-        body = body.replace(name, str(int(value)) if isinstance(value, bool) else str(value))
-    return body
+""".replace("    VALUES\n", VALUES)
 
 
 @wp.func_native(snippet(GATHER, AHEAD=int(AHEAD)))
@@ -216,8 +198,9 @@ def gather_batch(
     y0: int,
     listed: wp.array[int],  # [I]
     splats: wp.array[Splat],  # [V]
-    batch: wp.array2d[Fragment],  # [slots, 32] out
-    reached: wp.array3d[int],  # [slots, 2, 32] out: first and last row that each of them reaches
+    knobs: Knobs,
+    batch: wp.array2d[Seen],  # [slots, 32] out
+    reached: wp.array2d[int],  # [slots, 16] out: for each of them 16 bits, the rows that it reaches
 ): ...
 
 
@@ -243,8 +226,8 @@ def row_walk(depth: bool, record: bool) -> wp.Function:
         slot: int,
         row: int,
         order: int,  # of the batch's first fragment in the tile's list
-        batch: wp.array2d[Fragment],  # [slots, 32]
-        reached: wp.array3d[int],  # [slots, 2, 32] first and last row that each of them reaches
+        batch: wp.array2d[Seen],  # [slots, 32]
+        reached: wp.array2d[int],  # [slots, 16]
         knobs: Knobs,
         state: wp.array3d[Lanes],  # [slots, 16, planes] as in `color_walk`
     ) -> bool: ...
@@ -260,11 +243,13 @@ def fragment_replay(wide: bool, depth: bool, absolute: bool, min_passed: float) 
     @wp.func_native(snippet(BACKWARD, **constants))
     def replay_fragment(
         slot: int,
+        rank: int,  # of the splat
         place: int,  # of the fragment in the lists
         order: int,  # of the fragment in the tile's list
         column: int,  # of the tile
-        y0: int,  # first row of the tile
-        f: Fragment,
+        x0: int,  # first pixel of the tile
+        y0: int,
+        splats: wp.array[Splat],  # [V]
         features: wp.array3d[Lanes],  # [N, S, 1] (wide)
         last: wp.array2d[LaneIds],  # [H, tile columns]
         gradient: wp.array3d[Lanes],  # [H, tile columns, padded C (+ 1)]

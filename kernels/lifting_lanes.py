@@ -10,45 +10,20 @@ from functools import cache
 
 import warp as wp
 
-from sgwarp.kernels.binning import AHEAD, TILE, fragment_of, prefetch
-from sgwarp.kernels.compositing_lanes import (
-    CLOSE_EVERY,
-    lane_alphas,
-    lane_attenuated,
-    lane_contributions,
-    open_lanes,
-    open_row_mask,
-    still_open,
-)
+from sgwarp.kernels.binning import AHEAD, TILE, prefetch
+from sgwarp.kernels.compositing_lanes import CLOSE_EVERY, open_lanes, open_row_mask, still_open
 from sgwarp.kernels.gaussian import Splat
+from sgwarp.kernels.lifting_rows import fragment_lift, lift_fragment_ids
 from sgwarp.kernels.projection import Knobs
-from sgwarp.kernels.transmittance import LANE_OPTIONS, LANES, LaneIds, Lanes
+from sgwarp.kernels.transmittance import LANE_OPTIONS, LaneIds, Lanes
 
 wp.set_module_options(LANE_OPTIONS)
-
-FEW_IDS = wp.constant(4)  # up to here a masked sum per id beats adding pixel by pixel
-
-
-@wp.func
-def lane_sum(values: Lanes) -> float:
-    total = float(0.0)
-    for i in range(LANES):
-        total += values[i]
-    return total
-
-
-@wp.func
-def lane_sum_of(values: Lanes, ids: LaneIds, wanted: int) -> float:
-    """Sum over the lanes whose id is `wanted`."""
-    total = float(0.0)
-    for i in range(LANES):
-        total += wp.where(ids[i] == wanted, values[i], 0.0)
-    return total
 
 
 @cache
 def make_lift_dense(slices: int) -> wp.Kernel:
     """Kernel that lifts `16 slices` channels of a dense map (1 or 4 slices)."""
+    lift_fragment = fragment_lift(slices)
 
     @wp.kernel(module="unique", module_options=LANE_OPTIONS, enable_backward=False)
     def lift_dense(
@@ -75,7 +50,6 @@ def make_lift_dense(slices: int) -> wp.Kernel:
         column = tile % columns
         x0 = column * TILE
         y0 = (tile / columns) * TILE
-        inside = wp.min(LANES, width - x0)
         for row in range(TILE):
             state[slot, row, 0] = open_lanes(x0, width)
         open_rows = open_row_mask(y0, height)
@@ -83,45 +57,23 @@ def make_lift_dense(slices: int) -> wp.Kernel:
         stop = offsets[tile + 1]
         for k in range(first, stop):
             prefetch(splats, listed[wp.min(k + AHEAD, stop - 1)])
-            f = fragment_of(splats, listed[k], x0, y0)
-            sum0 = Lanes(0.0)
-            sum1 = Lanes(0.0)
-            sum2 = Lanes(0.0)
-            sum3 = Lanes(0.0)
-            weight = Lanes(0.0)
-            for row in range(f.first_row, f.last_row + 1):
-                if (open_rows >> row) & 1 != 0:
-                    T = state[slot, row, 0]
-                    alphas = lane_alphas(f, row, knobs)
-                    y = y0 + row
-                    w = wp.cw_mul(lane_contributions(alphas, T, knobs), valid[y, column, 0])
-                    state[slot, row, 0] = lane_attenuated(alphas, T, knobs)
-                    weight += w
-                    if wp.static(slices == 1):
-                        if inside == LANES:
-                            # Four sums in turn: one alone would wait for its own last addition.
-                            for i in range(0, LANES, 4):
-                                sum0 += w[i] * features[y, x0 + i, first_slice]
-                                sum1 += w[i + 1] * features[y, x0 + i + 1, first_slice]
-                                sum2 += w[i + 2] * features[y, x0 + i + 2, first_slice]
-                                sum3 += w[i + 3] * features[y, x0 + i + 3, first_slice]
-                        else:
-                            for i in range(inside):
-                                sum0 += w[i] * features[y, x0 + i, first_slice]
-                    else:
-                        for i in range(inside):
-                            sum0 += w[i] * features[y, x0 + i, first_slice]
-                            sum1 += w[i] * features[y, x0 + i, first_slice + 1]
-                            sum2 += w[i] * features[y, x0 + i, first_slice + 2]
-                            sum3 += w[i] * features[y, x0 + i, first_slice + 3]
-            if wp.static(slices == 1):
-                rows_out[k, 0] = (sum0 + sum1) + (sum2 + sum3)
-            else:
-                rows_out[k, 0] = sum0
-                rows_out[k, 1] = sum1
-                rows_out[k, 2] = sum2
-                rows_out[k, 3] = sum3
-            weights_out[k] = lane_sum(weight)
+            lift_fragment(
+                slot,
+                listed[k],
+                k,
+                column,
+                x0,
+                y0,
+                open_rows,
+                splats,
+                features,
+                valid,
+                first_slice,
+                knobs,
+                state,
+                rows_out,
+                weights_out,
+            )
             if (k - first) % CLOSE_EVERY == CLOSE_EVERY - 1:
                 open_rows = still_open(open_rows, state, slot)
 
@@ -165,47 +117,24 @@ def lift_ids(
             plain = False
     for k in range(first, stop):
         prefetch(splats, listed[wp.min(k + AHEAD, stop - 1)])
-        f = fragment_of(splats, listed[k], x0, y0)
         place = row_starts[tile] + (k - first) * ids
         starts_out[k] = place
-        if plain:
-            total = Lanes(0.0)
-            for row in range(f.first_row, f.last_row + 1):
-                if (open_rows >> row) & 1 != 0:
-                    T = state[slot, row, 0]
-                    alphas = lane_alphas(f, row, knobs)
-                    total += lane_contributions(alphas, T, knobs)
-                    state[slot, row, 0] = lane_attenuated(alphas, T, knobs)
-            weights_out[place] = lane_sum(total)
-            if (k - first) % CLOSE_EVERY == CLOSE_EVERY - 1:
-                open_rows = still_open(open_rows, state, slot)
-            continue
-        run = int(-1)  # id shared by the rows summed in `total` so far
-        total = Lanes(0.0)
-        for row in range(f.first_row, f.last_row + 1):
-            if (open_rows >> row) & 1 != 0:
-                T = state[slot, row, 0]
-                alphas = lane_alphas(f, row, knobs)
-                w = lane_contributions(alphas, T, knobs)
-                state[slot, row, 0] = lane_attenuated(alphas, T, knobs)
-                shared = uniform[tile, row]
-                if shared == -2:
-                    pixels = local_ids[tile, row]
-                    if ids <= FEW_IDS:
-                        for m in range(ids):
-                            weights_out[place + m] += lane_sum_of(w, pixels, m)
-                    else:
-                        for i in range(LANES):
-                            if pixels[i] >= 0:
-                                weights_out[place + pixels[i]] += w[i]
-                elif shared == run:
-                    total += w
-                else:
-                    if run >= 0:
-                        weights_out[place + run] += lane_sum(total)
-                    run = shared
-                    total = w
-        if run >= 0:
-            weights_out[place + run] += lane_sum(total)
+        lift_fragment_ids(
+            slot,
+            listed[k],
+            place,
+            tile,
+            x0,
+            y0,
+            open_rows,
+            ids,
+            plain,
+            splats,
+            local_ids,
+            uniform,
+            knobs,
+            state,
+            weights_out,
+        )
         if (k - first) % CLOSE_EVERY == CLOSE_EVERY - 1:
             open_rows = still_open(open_rows, state, slot)

@@ -9,7 +9,8 @@ import warp as wp
 from torch import Tensor
 
 from sgwarp.errors import InputError
-from sgwarp.kernels import binning, compositing_block, compositing_lanes
+from sgwarp.kernels import compositing_block, compositing_features, compositing_lanes
+from sgwarp.kernels.native import Seen
 from sgwarp.kernels.transmittance import Lanes
 from sgwarp.ops import tiles
 from sgwarp.ops.launch import get_threads, launch, launch_blocks, scratch, view
@@ -222,12 +223,12 @@ def lane_scratch(name: str, rows: int, planes: int, device: torch.device) -> wp.
 def batch_scratch(device: torch.device) -> list[wp.array]:
     """Scratch of the lane schedule for a batch of fragments and the rows they reach."""
     threads, batch = get_threads(), int(compositing_lanes.BATCH)
-    size = wp.types.type_size_in_bytes(binning.Fragment)
+    size = wp.types.type_size_in_bytes(Seen)
     memory = scratch("lanes batch", threads * batch * size // 4, torch.int32, device)
-    layout = {"dtype": binning.Fragment, "shape": (threads, batch), "capacity": 4 * len(memory)}
-    fragments: wp.array = wp.array(ptr=memory.data_ptr(), device=wp.device_from_torch(device), **layout)
-    reached = scratch("lanes reached", threads * 2 * batch, torch.int32, device).view(threads, 2, batch)
-    return [fragments, view(reached, wp.int32)]
+    layout = {"dtype": Seen, "shape": (threads, batch), "capacity": 4 * len(memory)}
+    seen: wp.array = wp.array(ptr=memory.data_ptr(), device=wp.device_from_torch(device), **layout)
+    reached = scratch("lanes reached", threads * TILE_ROWS, torch.int32, device).view(threads, TILE_ROWS)
+    return [seen, view(reached, wp.int32)]
 
 
 def in_slices(features: Tensor) -> Tensor:
@@ -262,16 +263,13 @@ def _composite_wide(
         inputs = [*lists.arrays(), view(slices, Lanes), *tail]
         launch_blocks(kernel, [lists.tile_count, count], inputs, outputs, device=device)
         return image
-    batch = compositing_lanes.BATCH
-    weights = lane_scratch("weights", TILE_ROWS, batch, device)
-    owners = scratch("owners", get_threads() * TILE_ROWS * batch, torch.int32, device)
-    owner_array = view(owners.view(get_threads(), TILE_ROWS, batch), wp.int32)
     first = 0
     while first < count:
         width_of_pass = WIDE_PASS if count - first >= WIDE_PASS else 1
-        kernel = compositing_lanes.make_composite_features(width_of_pass, record)
+        kernel = compositing_features.make_composite_features(width_of_pass, record)
         state = lane_scratch("state", TILE_ROWS, 1 + LANE * width_of_pass + record, device)
-        inputs = [*lists.arrays(), view(slices.unsqueeze(2), Lanes), first, *tail, state, weights, owner_array]
+        scratches = [state, *batch_scratch(device)]
+        inputs = [*lists.arrays(), view(slices.unsqueeze(2), Lanes), first, *tail, *scratches]
         launch(kernel, lists.tile_count, inputs, outputs, device=device, slots=True)
         first += width_of_pass
     return image

@@ -1,0 +1,114 @@
+"""What the innermost loops of the lane schedule share, in C++ with the compiler's vector types.
+
+Warp builds these snippets into its CPU kernels as they stand. Written in Warp, what a loop carries from one step to the
+next would go through memory; here it stays in registers. The arithmetic is that of `transmittance.py`; where AVX-512
+has an instruction for a step it is used, and the tests hold both ways to the same oracle.
+"""
+
+from functools import cache
+
+import warp as wp
+
+from sgwarp.kernels.gaussian import LEVEL_SLACK, Splat
+from sgwarp.kernels.transmittance import Lanes
+
+
+@wp.struct
+class Seen:
+    """A splat as a tile sees it: at row r and column i, alpha = 2^(top[r] - u^2) with u = middle[r] + a (i - 7.5)."""
+
+    middle: Lanes  # by row
+    top: Lanes
+    splat: Splat
+
+
+# Aligned like a float: views of a caller's tensors start anywhere.
+HELPERS = """
+    typedef float Row __attribute__((ext_vector_type(16), aligned(4)));
+    typedef int Ints __attribute__((ext_vector_type(16), aligned(4)));
+    const Row offsets = {-7.5f, -6.5f, -5.5f, -4.5f, -3.5f, -2.5f, -1.5f, -0.5f,
+                         0.5f, 1.5f, 2.5f, 3.5f, 4.5f, 5.5f, 6.5f, 7.5f};
+    const Row zero = 0.0f, one = 1.0f;
+    // One bit per lane in which a comparison holds.
+    const auto bits = [](Ints holds) -> unsigned {
+        using Bits = bool __attribute__((ext_vector_type(16)));
+        return __builtin_bit_cast(unsigned short, __builtin_convertvector(holds, Bits));
+    };
+    const auto sum = [](Row x) -> float {
+        const auto eight = x.lo + x.hi;
+        const auto four = eight.lo + eight.hi;
+        const auto two = four.lo + four.hi;
+        return two.x + two.y;
+    };
+    // 2^x for x <= 0, 2e-7 relative: the fraction goes into a minimax polynomial, the integer into the exponent.
+    const auto exp2 = [&](Row x) -> Row {
+#if defined(__AVX512DQ__) && !defined(SGWARP_PORTABLE)
+        const Row t = __builtin_ia32_reduceps512_mask(x, 1, zero, -1, 4);  // x - floor(x)
+        Row p = 1.8775767e-3f * t + 8.9893397e-3f;
+        p = p * t + 5.5826318e-2f;
+        p = p * t + 2.4015361e-1f;
+        p = p * t + 6.9315308e-1f;
+        p = p * t + 9.9999994e-1f;
+        return __builtin_ia32_scalefps512_mask(p, x, zero, -1, 4);
+#else
+        const Row t = x * 0.0625f;  // as `exp2_falling`
+        Row p = 1.2747483491e-03f + t * 1.0902324732e-04f;
+        p = 9.5791797294e-03f + t * p;
+        p = 5.5490757104e-02f + t * p;
+        p = 2.4022436783e-01f + t * p;
+        p = 6.9314706433e-01f + t * p;
+        p = 1.0f + t * p;
+        p = p * p;
+        p = p * p;
+        p = p * p;
+        return p * p;
+#endif
+    };
+    // 1 / x to 2e-7 relative, x neither tiny nor huge.
+    const auto reciprocal = [&](Row x) -> Row {
+#if defined(__AVX512F__) && !defined(SGWARP_PORTABLE)
+        const Row guess = __builtin_ia32_rcp14ps512_mask(x, zero, -1);
+        return guess * (2.0f - x * guess);
+#else
+        return one / x;
+#endif
+    };
+    // A splat as the tile at (x0, y0) sees it; returns a bit for each row in which some pixel may pass alpha_min.
+    const auto see = [&](const auto& s, int x0, int y0, const auto& knobs, Row& middle, Row& top) -> unsigned {
+        const float left = x0, above = y0;
+        const float x = s.mean[0] - left - 0.5f, y = s.mean[1] - above - 0.5f;
+        const Row dy = offsets + (7.5f - y), v = s.c * dy;
+        middle = s.b * dy + s.a * (7.5f - x);
+        top = s.level - v * v;
+        const Row nearest = __builtin_elementwise_max(__builtin_elementwise_abs(middle) - 7.5f * s.a, zero);
+        return bits(nearest * nearest <= top - (knobs.alpha_min_level - LEVEL_SLACK));
+    };
+    // Opacity at 16 pixels.
+    const auto opacity = [&](Row u, float top, const auto& knobs) -> Row {
+        const Row level = top - u * u;
+        return level < knobs.alpha_min_level ? zero : __builtin_elementwise_min(exp2(level), one * knobs.alpha_max);
+    };
+"""
+
+
+def snippet(body: str, **constants: object) -> str:
+    """The C++ of a loop, with its options filled in; what they switch off the compiler removes."""
+    body = HELPERS + body
+    for name, value in {"LEVEL_SLACK": f"{float(LEVEL_SLACK)}f", **constants}.items():
+        body = body.replace(name, str(int(value)) if isinstance(value, bool) else str(value))
+    return body
+
+
+@cache
+def power_and_reciprocal(portable: bool) -> wp.Function:
+    """Device function that writes 2^x and 1 / x, with what the machine has or as any machine can (for the tests)."""
+    switch = "#define SGWARP_PORTABLE" if portable else "#undef SGWARP_PORTABLE"
+    store = """
+    reinterpret_cast<Row*>(powers.data)[i] = exp2(reinterpret_cast<const Row*>(x.data)[i]);
+    reinterpret_cast<Row*>(reciprocals.data)[i] = reciprocal(reinterpret_cast<const Row*>(x.data)[i]);
+    """
+
+    @wp.func_native(f"\n{switch}\n{snippet(store)}\n#undef SGWARP_PORTABLE\n")
+    def evaluate(i: int, x: wp.array[Lanes], powers: wp.array[Lanes], reciprocals: wp.array[Lanes]): ...
+
+    return evaluate
