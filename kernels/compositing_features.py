@@ -73,23 +73,8 @@ FORWARD = (
 """
 )
 
-# A row of the scratch as pixels of the image: rows and columns of 16 x 16 values change places.
+# A row of the scratch as pixels of the image.
 WRITE = """
-#define EXCHANGE(stride, LOW, HIGH)                                          \\
-    for (int i = 0; i < 16; ++i)                                             \\
-        if (!(i & stride)) {                                                 \\
-            const Row a = square[i], b = square[i + stride];                 \\
-            square[i] = __builtin_shufflevector(a, b, LOW);                  \\
-            square[i + stride] = __builtin_shufflevector(a, b, HIGH);        \\
-        }
-#define LOW_8 0, 1, 2, 3, 4, 5, 6, 7, 16, 17, 18, 19, 20, 21, 22, 23
-#define HIGH_8 8, 9, 10, 11, 12, 13, 14, 15, 24, 25, 26, 27, 28, 29, 30, 31
-#define LOW_4 0, 1, 2, 3, 16, 17, 18, 19, 8, 9, 10, 11, 24, 25, 26, 27
-#define HIGH_4 4, 5, 6, 7, 20, 21, 22, 23, 12, 13, 14, 15, 28, 29, 30, 31
-#define LOW_2 0, 1, 16, 17, 4, 5, 20, 21, 8, 9, 24, 25, 12, 13, 28, 29
-#define HIGH_2 2, 3, 18, 19, 6, 7, 22, 23, 10, 11, 26, 27, 14, 15, 30, 31
-#define LOW_1 0, 16, 2, 18, 4, 20, 6, 22, 8, 24, 10, 26, 12, 28, 14, 30
-#define HIGH_1 1, 17, 3, 19, 5, 21, 7, 23, 9, 25, 11, 27, 13, 29, 15, 31
     const Row* const row_state = reinterpret_cast<const Row*>(state.data + (slot * 16 + row) * state.shape[2]);
     const Row T = __builtin_elementwise_abs(row_state[0]);
     const int width = features_out.shape[1], channels = features_out.shape[2];
@@ -98,10 +83,7 @@ WRITE = """
         Row square[16];
 #pragma clang loop unroll(full)
         for (int i = 0; i < 16; ++i) square[i] = row_state[1 + 16 * s + i];
-        EXCHANGE(8, LOW_8, HIGH_8)
-        EXCHANGE(4, LOW_4, HIGH_4)
-        EXCHANGE(2, LOW_2, HIGH_2)
-        EXCHANGE(1, LOW_1, HIGH_1)
+        transpose(square);
         const int first = 16 * (first_slice + s);
         float* out = features_out.data + (y * width + x0) * channels + first;
         for (int i = 0; i < inside; ++i, out += channels) {

@@ -22,7 +22,7 @@ from functools import cache
 import warp as wp
 
 from sgwarp.kernels.binning import AHEAD, TILE, prefetch
-from sgwarp.kernels.compositing_rows import fragment_replay
+from sgwarp.kernels.compositing_rows import fragment_replay, read_tile
 from sgwarp.kernels.gaussian import Splat
 from sgwarp.kernels.projection import Knobs
 from sgwarp.kernels.transmittance import LANE_OPTIONS, LaneIds, Lanes
@@ -45,9 +45,9 @@ def make_composite_backward(wide: bool, depth: bool, absolute: bool) -> wp.Kerne
     """Kernel that differentiates compositing.
 
     Args:
-        wide: The values are `features` of any number of channels instead of the splats' three colours; gradients with
-            respect to features are not computed here: they are the image's gradient, lifted.
-        depth: The sum of alpha T z has a gradient too; it is the plane after the channels.
+        wide: The values are `features` of any number of channels instead of the splats' three colours. Their
+            gradient is the image's gradient lifted: here, where there is room for it, or by `lifting_lanes.py`.
+        depth: The sum of alpha T z has a gradient too.
         absolute: Also sum the magnitudes of each pixel's gradient of the projected mean.
     """
     replay_fragment = fragment_replay(wide, depth, absolute, MIN_PASSED)
@@ -64,7 +64,9 @@ def make_composite_backward(wide: bool, depth: bool, absolute: bool) -> wp.Kerne
         transmittance: wp.array2d[Lanes],  # [H, tile columns]
         v_transmittance: wp.array2d[Lanes],  # [H, tile columns] its gradient
         last: wp.array2d[LaneIds],  # [H, tile columns] last contributor, counted from its tile's first, -1 = none
-        gradient: wp.array3d[Lanes],  # [H, tile columns, padded C (+ 1)] gradient of the image (and depth sum)
+        gradient: wp.array3d[Lanes],  # [H, tile columns, 3] of the image; or scratch [slots, 16, 16 S] (wide)
+        pixels: wp.array3d[Lanes],  # [H, W, S] gradient of the image (wide)
+        depth_gradient: wp.array2d[Lanes],  # [H, tile columns] of the depth sum (depth)
         knobs: Knobs,
         width: int,
         height: int,
@@ -72,6 +74,7 @@ def make_composite_backward(wide: bool, depth: bool, absolute: bool) -> wp.Kerne
         reach: wp.array2d[int],  # [slots, 16] scratch: last contributor of each row
         # Out:
         rows_out: wp.array[Lanes],  # [I] by place, column q in lane q
+        features_out: wp.array2d[Lanes],  # [I, S] gradient of the features, by place; or empty (wide)
     ):
         """Paper eq. 1, differentiated, for one tile per thread."""
         tile = base + wp.tid()
@@ -91,13 +94,34 @@ def make_composite_backward(wide: bool, depth: bool, absolute: bool) -> wp.Kerne
         first = offsets[tile]
         for k in range(first + tile_reach + 1, offsets[tile + 1]):
             rows_out[k] = Lanes(0.0)
+            if wp.static(wide):
+                for s in range(features_out.shape[1]):
+                    features_out[k, s] = Lanes(0.0)
+        if wp.static(wide):
+            read_tile(slot, x0, y0, wp.min(TILE, height - y0), wp.min(TILE, width - x0), pixels, gradient)
         for done in range(tile_reach + 1):
             order = tile_reach - done  # counted from the tile's first, as all orders here
             k = first + order
             prefetch(splats, listed[first + wp.max(order - AHEAD, 0)])
-            rank = listed[k]
             replay_fragment(
-                slot, rank, k, order, column, x0, y0, splats, features, last, gradient, knobs, state, reach, rows_out
+                slot,
+                listed[k],
+                k,
+                order,
+                column,
+                x0,
+                y0,
+                splats,
+                features,
+                last,
+                gradient,
+                pixels,
+                depth_gradient,
+                knobs,
+                state,
+                reach,
+                rows_out,
+                features_out,
             )
 
     return composite_backward

@@ -87,6 +87,22 @@ FORWARD = (
 """
 )
 
+# The gradient of a tile's pixels, [H, W, S] in slices of 16 channels, with 16 pixels of a row in a vector.
+READ = """
+    const int width = pixels.shape[1], slices = pixels.shape[2];
+    for (int row = 0; row < rows; ++row)
+        for (int s = 0; s < slices; ++s) {
+            const Row* const from = reinterpret_cast<const Row*>(pixels.data) + ((y0 + row) * width + x0) * slices + s;
+            Row square[16];
+#pragma clang loop unroll(full)
+            for (int i = 0; i < 16; ++i) square[i] = i < inside ? from[i * slices] : zero;
+            transpose(square);
+            Row* const to = reinterpret_cast<Row*>(gradient.data) + (slot * 16 + row) * gradient.shape[2] + 16 * s;
+#pragma clang loop unroll(full)
+            for (int i = 0; i < 16; ++i) to[i] = square[i];
+        }
+"""
+
 # The value of a splat at each of its rows: its features under the image's gradient, four rows at a time.
 VALUES = """
     Row values[16];
@@ -98,7 +114,7 @@ VALUES = """
         for (int j = 0; j < 4; ++j) {
             of[j] = rest ? __builtin_ctz(rest) : of[j - 1];
             rest &= rest - 1;
-            v_rows[j] = reinterpret_cast<const Row*>(gradient.data + ((y0 + of[j]) * columns + column) * planes);
+            v_rows[j] = reinterpret_cast<const Row*>(gradient.data + (slot * 16 + of[j]) * planes);
         }
         Row a = zero, b = zero, c = zero, d = zero;
         for (int i = 0; i < 16 * slices; ++i) {
@@ -106,6 +122,37 @@ VALUES = """
             a += xi * v_rows[0][i], b += xi * v_rows[1][i], c += xi * v_rows[2][i], d += xi * v_rows[3][i];
         }
         values[of[0]] = a, values[of[1]] = b, values[of[2]] = c, values[of[3]] = d;
+    }
+"""
+
+# The gradient of a splat's features: the image's gradient under its weights.
+FEATURES = """
+    const int width = pixels.shape[1];
+    for (int first = 0; first < features_out.shape[1]; first += 4) {
+        Row sums[4] = {zero, zero, zero, zero};
+        const int count = slices - first < 4 ? slices - first : 4;
+        for (unsigned rest = left; rest; rest &= rest - 1) {
+            const int row = __builtin_ctz(rest);
+            const Row* const v = reinterpret_cast<const Row*>(pixels.data) + ((y0 + row) * width + x0) * slices + first;
+            const float* const w = reinterpret_cast<const float*>(weights + row);
+            unsigned some = bits(weights[row] > zero);
+            if (slices == 1 && x0 + 16 <= width)  // one vector a pixel: all are faster than finding out which
+                for (int i = 0; i < 16; i += 4)
+                    for (int j = 0; j < 4; ++j) sums[j] += w[i + j] * v[i + j];
+            else if (count == 4)
+                for (; some; some &= some - 1) {
+                    const int i = __builtin_ctz(some);
+                    for (int j = 0; j < 4; ++j) sums[j] += w[i] * v[i * slices + j];
+                }
+            else
+                for (; some; some &= some - 1) {
+                    const int i = __builtin_ctz(some);
+                    for (int j = 0; j < count; ++j) sums[j] += w[i] * v[i * slices + j];
+                }
+        }
+        Row* const out = reinterpret_cast<Row*>(features_out.data) + place * slices + first;
+        if (slices == 1) out[0] = (sums[0] + sums[1]) + (sums[2] + sums[3]);
+        else for (int j = 0; j < count; ++j) out[j] = sums[j];
     }
 """
 
@@ -117,6 +164,8 @@ BACKWARD = """
     const unsigned left = see(s, x0, y0, knobs, middles, tops) & bits(row_ends >= order);
     if (!left) {
         *reinterpret_cast<Row*>(rows.data + place) = zero;
+        for (int j = 0; WIDE && j < features_out.shape[1]; ++j)
+            reinterpret_cast<Row*>(features_out.data)[place * features_out.shape[1] + j] = zero;
         return;
     }
     float middle_of[16] __attribute__((aligned(64))), top_of[16] __attribute__((aligned(64)));
@@ -124,31 +173,34 @@ BACKWARD = """
     const float above = y0, y = s.mean[1] - above - 0.5f;
     const int middle_row = (__builtin_ctz(left) + 31 - __builtin_clz(left)) / 2;
 #if WIDE
+    Row weights[16] __attribute__((aligned(64)));
     VALUES
 #endif
     Row g0 = zero, g1 = zero, g2 = zero, red = zero, green = zero, blue = zero, z = zero, across = zero, down = zero;
     for (unsigned rest = left; rest; rest &= rest - 1) {
         const int row = __builtin_ctz(rest);
-        const int pixels = (y0 + row) * columns + column;
-        const Row* const v_row = reinterpret_cast<const Row*>(gradient.data + pixels * planes);
+        const int at = (y0 + row) * columns + column;
         Row* const row_state = reinterpret_cast<Row*>(state.data + (slot * 16 + row) * 2);
         const Row u = offsets * s.a + middle_of[row];
         Row alpha = opacity(u, top_of[row], knobs);
-        alpha = *reinterpret_cast<const Ints*>(last.data + pixels) >= order ? alpha : zero;
+        alpha = *reinterpret_cast<const Ints*>(last.data + at) >= order ? alpha : zero;
         const Row T = row_state[0] * reciprocal(__builtin_elementwise_max(one - alpha, one * MIN_PASSED));
         const Row w = alpha * T;
         Row value = zero;
 #if WIDE
         value = values[row];
+        weights[row] = w;
 #else
+        const Row* const v_row = reinterpret_cast<const Row*>(gradient.data + at * planes);
         value = s.color[0] * v_row[0] + s.color[1] * v_row[1] + s.color[2] * v_row[2];
         red += w * v_row[0];
         green += w * v_row[1];
         blue += w * v_row[2];
 #endif
         if (DEPTH) {
-            value += s.depth * v_row[planes - 1];
-            z += w * v_row[planes - 1];
+            const Row v_depth = reinterpret_cast<const Row*>(depth_gradient.data)[at];
+            value += s.depth * v_depth;
+            z += w * v_depth;
         }
         const Row excess = value - row_state[1];
         row_state[0] = T;
@@ -186,7 +238,10 @@ BACKWARD = """
     const Row q0 = FOLD_4(p0, p1), q1 = FOLD_4(p2, p3), q2 = FOLD_4(p4, p5);
     const Row r0 = FOLD_2(q0, q1), r1 = FOLD_2(q2, zero);
     *reinterpret_cast<Row*>(rows.data + place) = FOLD_1(r0, r1);
-""".replace("    VALUES\n", VALUES)
+#if WIDE
+    FEATURES
+#endif
+""".replace("    VALUES\n", VALUES).replace("    FEATURES\n", FEATURES)
 
 
 @wp.func_native(snippet(GATHER, AHEAD=int(AHEAD)))
@@ -235,6 +290,18 @@ def row_walk(depth: bool, record: bool) -> wp.Function:
     return composite_row
 
 
+@wp.func_native(snippet(READ))
+def read_tile(
+    slot: int,
+    x0: int,  # first pixel of the tile
+    y0: int,
+    rows: int,  # that lie in the image
+    inside: int,  # columns
+    pixels: wp.array3d[Lanes],  # [H, W, S]
+    gradient: wp.array3d[Lanes],  # [slots, 16, 16 S] out
+): ...
+
+
 @cache
 def fragment_replay(wide: bool, depth: bool, absolute: bool, min_passed: float) -> wp.Function:
     """Device function that differentiates one fragment of a tile and steps the tile's state to the front of it."""
@@ -252,11 +319,14 @@ def fragment_replay(wide: bool, depth: bool, absolute: bool, min_passed: float) 
         splats: wp.array[Splat],  # [V]
         features: wp.array3d[Lanes],  # [N, S, 1] (wide)
         last: wp.array2d[LaneIds],  # [H, tile columns]
-        gradient: wp.array3d[Lanes],  # [H, tile columns, padded C (+ 1)]
+        gradient: wp.array3d[Lanes],  # [H, tile columns, 3], or of the tile, as `read_tile` leaves it (wide)
+        pixels: wp.array3d[Lanes],  # [H, W, S] the same pixel by pixel (wide)
+        depth_gradient: wp.array2d[Lanes],  # [H, tile columns] (depth)
         knobs: Knobs,
         state: wp.array3d[Lanes],  # [slots, 16, 2] transmittance, value behind
         reach: wp.array2d[int],  # [slots, 16]
         rows: wp.array[Lanes],  # [I] by place, column q in lane q
+        features_out: wp.array2d[Lanes],  # [I, S] by place, or empty (wide)
     ): ...
 
     return replay_fragment

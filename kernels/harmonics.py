@@ -7,6 +7,7 @@ from sgwarp.kernels.gaussian import EXACT_OPTIONS, Pinhole
 wp.set_module_options(EXACT_OPTIONS)
 
 
+AHEAD = wp.constant(8)  # ranks between the one at work and the one that is fetched
 BRIGHTEST = wp.constant(1.0e30)
 
 
@@ -35,6 +36,19 @@ def harmonics_color(sh: wp.array2d[wp.vec3], i: int, degree: int, direction: wp.
     return wp.min(wp.max(color, wp.vec3(0.0, 0.0, 0.0)), wp.vec3(BRIGHTEST, BRIGHTEST, BRIGHTEST))
 
 
+@wp.func_native("""
+#if !defined(__CUDA_ARCH__)
+    __builtin_prefetch(means.data + i);
+    const auto* const first = sh.data + i * sh.shape[1];
+    for (int k = 0; k < coefficients; k += 5) __builtin_prefetch(first + k);  // 5 colours to a line of the cache
+    __builtin_prefetch(first + coefficients - 1);
+#endif
+""")
+def prefetch_harmonics(
+    means: wp.array[wp.vec3], sh: wp.array2d[wp.vec3], i: int, coefficients: int
+): ...  # a hint for the CPU's cache
+
+
 @wp.kernel
 def evaluate_harmonics(
     # In:
@@ -50,5 +64,7 @@ def evaluate_harmonics(
     """View-dependent colour of the visible Gaussians, in depth order; others are not read."""
     k = base + wp.tid()
     i = order[k]
+    ahead = order[wp.min(k + AHEAD, order.shape[0] - 1)]
+    prefetch_harmonics(means, sh, ahead, (degree + 1) * (degree + 1))
     away = (means[i] - camera.center) - camera.center_rest
     colors_out[k] = harmonics_color(sh, i, degree, wp.normalize(away))

@@ -10,6 +10,7 @@ from sgwarp.kernels.transmittance import LaneIds, Lanes
 # Loops over the rows and pixels of a tile stay loops: unrolled they compile for seconds and run no faster.
 wp.set_module_options({"enable_backward": False, "fast_math": False, "max_unroll": 1})
 
+ROWS_AHEAD = wp.constant(16)  # entries between the one that is added and the one that is fetched
 MAX_IDS = wp.constant(256)  # a tile has 256 pixels, so no more ids
 
 
@@ -60,6 +61,15 @@ def localize_ids(
     tile_id_counts_out[tile] = count
 
 
+@wp.func_native("""
+#if !defined(__CUDA_ARCH__)
+    if (entry < places.shape[0])
+        for (int s = 0; s < rows.shape[1]; ++s) __builtin_prefetch(rows.data + places.data[entry] * rows.shape[1] + s);
+#endif
+""")
+def prefetch_rows(rows: wp.array2d[Lanes], places: wp.array[int], entry: int): ...  # a hint for the CPU's cache
+
+
 @wp.kernel
 def sum_rows(
     # In:
@@ -79,6 +89,7 @@ def sum_rows(
     for s in range(slices):
         total = Lanes(0.0)
         for e in range(entries[k], entries[k + 1]):
+            prefetch_rows(rows, places, e + wp.where(s == 0, ROWS_AHEAD, places.shape[0]))
             total += rows[places[e], s]
         features_out[i, first_slice + s] += total
 

@@ -73,6 +73,28 @@ HELPERS = """
         return one / x;
 #endif
     };
+    // Rows and columns of 16 x 16 values change places: squares of 8, 4, 2 and 1 across the diagonal.
+#define EXCHANGE(step, low, high)                                    \\
+    for (int i = 0; i < 16; ++i)                                     \\
+        if (!(i & step)) {                                           \\
+            const Row a = square[i], b = square[i + step];           \\
+            square[i] = __builtin_shufflevector(a, b, low);          \\
+            square[i + step] = __builtin_shufflevector(a, b, high);  \\
+        }
+#define LOW_8 0, 1, 2, 3, 4, 5, 6, 7, 16, 17, 18, 19, 20, 21, 22, 23
+#define HIGH_8 8, 9, 10, 11, 12, 13, 14, 15, 24, 25, 26, 27, 28, 29, 30, 31
+#define LOW_4 0, 1, 2, 3, 16, 17, 18, 19, 8, 9, 10, 11, 24, 25, 26, 27
+#define HIGH_4 4, 5, 6, 7, 20, 21, 22, 23, 12, 13, 14, 15, 28, 29, 30, 31
+#define LOW_2 0, 1, 16, 17, 4, 5, 20, 21, 8, 9, 24, 25, 12, 13, 28, 29
+#define HIGH_2 2, 3, 18, 19, 6, 7, 22, 23, 10, 11, 26, 27, 14, 15, 30, 31
+#define LOW_1 0, 16, 2, 18, 4, 20, 6, 22, 8, 24, 10, 26, 12, 28, 14, 30
+#define HIGH_1 1, 17, 3, 19, 5, 21, 7, 23, 9, 25, 11, 27, 13, 29, 15, 31
+    const auto transpose = [](Row (&square)[16]) {
+        EXCHANGE(8, LOW_8, HIGH_8)
+        EXCHANGE(4, LOW_4, HIGH_4)
+        EXCHANGE(2, LOW_2, HIGH_2)
+        EXCHANGE(1, LOW_1, HIGH_1)
+    };
     // A splat as the tile at (x0, y0) sees it; returns a bit for each row in which some pixel may pass alpha_min.
     const auto see = [&](const auto& s, int x0, int y0, const auto& knobs, Row& middle, Row& top) -> unsigned {
         const float left = x0, above = y0;

@@ -6,6 +6,7 @@ Exit codes: 0 done, 2 bad input or usage (one line on stderr says what), 130 int
 from __future__ import annotations
 
 import logging
+import os
 import shlex
 import sys
 from collections.abc import Iterator, Sequence
@@ -22,6 +23,8 @@ def main(argv: Sequence[str] | None = None) -> int:
         SystemExit: After --help, or with code 2 if the arguments do not fit.
     """
     argv = list(sys.argv[1:] if argv is None else argv)
+    # torch's threads would go on spinning for a while after each operation, on the cores that kernels then wait for.
+    os.environ.setdefault("OMP_WAIT_POLICY", "passive")
     if argv == ["--version"]:
         print(__version__)
         return 0

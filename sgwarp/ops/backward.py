@@ -13,6 +13,7 @@ from torch.nn.functional import pad
 from sgwarp.kernels import compositing_block_backward, compositing_lanes_backward, harmonics_backward
 from sgwarp.kernels import projection_backward as kernels
 from sgwarp.kernels.compositing_lanes_backward import MOMENTS, row_columns
+from sgwarp.kernels.lifting import sum_rows
 from sgwarp.kernels.transmittance import LaneIds, Lanes
 from sgwarp.ops import tiles
 from sgwarp.ops.launch import get_threads, launch, launch_blocks, scratch, view
@@ -21,6 +22,7 @@ from sgwarp.ops.rasterize import LANE, TILE_ROWS, in_slices, lane_scratch, runs_
 from sgwarp.ops.settings import RasterSettings
 from sgwarp.scene import Camera, FeatureMap, Gaussians
 
+TOGETHER = 4  # slices of 16 channels up to which the features' gradient comes with the geometry's
 GROUPS = 1024  # partial sums of the pose's gradient
 
 
@@ -111,6 +113,9 @@ def composite_backward(
     sums = torch.zeros(count, LANE, device=device)
     rows = scratch("backward rows", lists.intersections * LANE if ordered else 0, torch.float32, device).view(-1, LANE)
     slices = in_slices(features if wide and features is not None else zeros[:1, :1])
+    together = wide and not block and slices.shape[1] <= TOGETHER
+    shape = (lists.intersections, slices.shape[1], LANE) if together else (0, 0, LANE)
+    feature_rows = scratch("feature rows", math.prod(shape), torch.float32, device).view(shape)
     head = lists.arrays()
     size = [tiles.knobs(settings), camera.width, camera.height]
     if block:
@@ -120,20 +125,26 @@ def composite_backward(
         outputs = [view(rows if ordered else sums, wp.float32)]
         launch_blocks(kernel, [lists.tile_count], inputs, outputs, device=device)
     else:
-        shape = (camera.height, -(-camera.width // LANE), (slices.shape[1] * LANE if wide else 3) + depth, LANE)
-        gradient = scratch("backward gradient", math.prod(shape), torch.float32, device).view(shape)
-        _channels_in_lanes(v_image, gradient[:, :, : shape[2] - depth])
-        if depth:
-            _channels_in_lanes(v_depth[..., None], gradient[:, :, shape[2] - 1 :])
+        columns = -(-camera.width // LANE)
+        pixels = in_slices(v_image if wide else zeros[:0, :0, None])
+        if wide:
+            gradient = lane_scratch("backward gradient", TILE_ROWS, slices.shape[1] * LANE, device)
+        else:
+            by_row = scratch("backward gradient", camera.height * columns * 3 * LANE, torch.float32, device)
+            by_row = by_row.view(camera.height, columns, 3, LANE)
+            _channels_in_lanes(v_image, by_row)
+            gradient = view(by_row, Lanes)
         maps = [view(_in_lanes(transmittance, 1.0), Lanes), view(_in_lanes(v_transmittance, 0.0), Lanes)]
-        maps += [view(_in_lanes(last, -1), LaneIds), view(gradient, Lanes)]
+        maps += [view(_in_lanes(last, -1), LaneIds), gradient, view(pixels, Lanes)]
+        maps += [view(_in_lanes(v_depth if depth else zeros[:0], 0.0), Lanes)]
         scratches = [
             lane_scratch("backward state", TILE_ROWS, 2, device),
             view(scratch("reach", get_threads() * TILE_ROWS, torch.int32, device).view(-1, TILE_ROWS), wp.int32),
         ]
         inputs = [*head, view(slices.unsqueeze(2), Lanes), *maps, *size]
         kernel = compositing_lanes_backward.make_composite_backward(wide, depth, absolute)
-        launch(kernel, lists.tile_count, [*inputs, *scratches], [view(rows, Lanes)], device=device, slots=True)
+        outputs = [view(rows, Lanes), view(feature_rows, Lanes)]
+        launch(kernel, lists.tile_count, [*inputs, *scratches], outputs, device=device, slots=True)
     if ordered:
         inputs = [*lists.sums(), view(rows, Lanes)]
         launch(kernels.sum_intersections, len(lists.order), inputs, [view(sums, Lanes)], device=device)
@@ -143,6 +154,11 @@ def composite_backward(
         sums[:, at_depth].index_add_(0, hit.clamp(min=0).flatten().to(torch.int64), at_hit)
     if not wide:
         v_features = sums[:, MOMENTS : MOMENTS + channels]
+    elif together:
+        totals = torch.zeros(count, *slices.shape[1:], device=device)
+        inputs = [*lists.sums(), view(feature_rows, Lanes), 0, slices.shape[1]]
+        launch(sum_rows, len(lists.order), inputs, [view(totals, Lanes)], device=device)
+        v_features = totals.flatten(1)[:, :channels]
     else:
         v_features = _lift_gradient(lists, camera, v_image, settings, count, block, ordered)
     # The kernel leaves out the factor of d(2^x) = ln 2 2^x dx, and that of the square.

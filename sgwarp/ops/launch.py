@@ -7,13 +7,17 @@ threads take chunks in turn; every kernel writes disjoint memory, so the result 
 from __future__ import annotations
 
 import itertools
+import math
 import os
 import sys
 import threading
+import weakref
+from collections import deque
 from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
 from typing import Any
 
+import numpy as np
 import torch
 import warp as wp
 from torch import Tensor
@@ -187,6 +191,48 @@ def scratch(name: str, count: int, dtype: torch.dtype, device: torch.device) -> 
     return held[:count]
 
 
+LARGE = 32 * 2**20  # the C library maps what is larger anew each time, and the system clears every page
+MAX_IDLE = 2  # large images that are kept for the next one of their size
+
+
+class _Lent(np.ndarray):
+    """Memory of a tensor that was given away; unlike a plain array it can be watched for its end."""
+
+
+_idle: deque[np.ndarray] = deque(maxlen=MAX_IDLE)
+
+
+def fresh(*shape: int, device: torch.device) -> Tensor:
+    """An uninitialised float32 tensor for the caller to keep; large ones on the CPU use again what others left.
+
+    Clearing the pages of 64 channels takes about as long as compositing them.
+    """
+    count = math.prod(shape)
+    if device.type != "cpu" or 4 * count <= LARGE:
+        return torch.empty(shape, device=device)
+    owner = _left_over(count)
+    return _lend(np.empty(count, dtype=np.float32) if owner is None else owner, shape)
+
+
+def _left_over(count: int) -> np.ndarray | None:
+    for _ in range(MAX_IDLE):
+        try:
+            owner = _idle.popleft()
+        except IndexError:  # none is left, or another thread took it
+            return None
+        if len(owner) == count:
+            return owner
+        _idle.append(owner)
+    return None
+
+
+def _lend(owner: np.ndarray, shape: tuple[int, ...]) -> Tensor:
+    lent = owner.view(_Lent)
+    weakref.finalize(lent, _idle.append, owner).atexit = False
+    return torch.from_numpy(lent).view(shape)
+
+
 def release_scratch() -> None:
-    """Give the calling thread's scratch memory back."""
+    """Give the calling thread's scratch memory back, and what large images left."""
     _local.__dict__.pop("store", None)
+    _idle.clear()

@@ -13,7 +13,7 @@ from sgwarp.kernels import compositing_block, compositing_features, compositing_
 from sgwarp.kernels.native import Seen
 from sgwarp.kernels.transmittance import Lanes
 from sgwarp.ops import tiles
-from sgwarp.ops.launch import get_threads, launch, launch_blocks, scratch, view
+from sgwarp.ops.launch import fresh, get_threads, launch, launch_blocks, scratch, view
 from sgwarp.ops.plan import RenderPlan, Values, plan_render
 from sgwarp.ops.settings import RasterSettings
 from sgwarp.scene import Camera, Gaussians
@@ -252,7 +252,7 @@ def _composite_wide(
 ) -> Tensor:
     device = lists.order.device
     height, width = camera.size
-    image = torch.empty(height, width, features.shape[1], device=device)
+    image = fresh(height, width, features.shape[1], device=device)
     slices = in_slices(features)
     count = slices.shape[1]
     tail = [tiles.knobs(settings), width, height]
