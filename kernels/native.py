@@ -1,8 +1,8 @@
 """What the innermost loops of the lane schedule share, in C++ with the compiler's vector types.
 
 Warp builds these snippets into its CPU kernels as they stand. Written in Warp, what a loop carries from one step to the
-next would go through memory; here it stays in registers. The arithmetic is that of `transmittance.py`; where AVX-512
-has an instruction for a step it is used, and the tests hold both ways to the same oracle.
+next would go through memory; here it stays in registers. Where AVX-512 has an instruction for a step it is used, and
+the tests hold both ways to the same oracle.
 """
 
 from functools import cache
@@ -40,28 +40,23 @@ HELPERS = """
         const auto two = four.lo + four.hi;
         return two.x + two.y;
     };
-    // 2^x for x <= 0, 2e-7 relative: the fraction goes into a minimax polynomial, the integer into the exponent.
+    // 2^x for -100 <= x <= 0, 2e-7 relative, anything below: the part after the integer goes into a minimax polynomial,
+    // the integer into the exponent.
     const auto exp2 = [&](Row x) -> Row {
 #if defined(__AVX512DQ__) && !defined(SGWARP_PORTABLE)
         const Row t = __builtin_ia32_reduceps512_mask(x, 1, zero, -1, 4);  // x - floor(x)
+#else
+        const Row whole = __builtin_elementwise_floor(x), t = x - whole;
+#endif
         Row p = 1.8775767e-3f * t + 8.9893397e-3f;
         p = p * t + 5.5826318e-2f;
         p = p * t + 2.4015361e-1f;
         p = p * t + 6.9315308e-1f;
         p = p * t + 9.9999994e-1f;
+#if defined(__AVX512DQ__) && !defined(SGWARP_PORTABLE)
         return __builtin_ia32_scalefps512_mask(p, x, zero, -1, 4);
 #else
-        const Row t = x * 0.0625f;  // as `exp2_falling`
-        Row p = 1.2747483491e-03f + t * 1.0902324732e-04f;
-        p = 9.5791797294e-03f + t * p;
-        p = 5.5490757104e-02f + t * p;
-        p = 2.4022436783e-01f + t * p;
-        p = 6.9314706433e-01f + t * p;
-        p = 1.0f + t * p;
-        p = p * p;
-        p = p * p;
-        p = p * p;
-        return p * p;
+        return reinterpret_cast<Row>(reinterpret_cast<Ints>(p) + (__builtin_convertvector(whole, Ints) << 23));
 #endif
     };
     // 1 / x to 2e-7 relative, x neither tiny nor huge.

@@ -31,8 +31,18 @@ from matplotlib.collections import EllipseCollection
 from matplotlib.patches import Rectangle
 
 import sgwarp as sg
-from sgwarp.kernels import binning, compositing_block, compositing_lanes, harmonics, lifting, lifting_lanes, projection
+from sgwarp.kernels import (
+    binning,
+    compositing_block,
+    compositing_features,
+    compositing_lanes,
+    harmonics,
+    lifting,
+    lifting_lanes,
+    projection,
+)
 from sgwarp.kernels.gaussian import Pinhole, Splat
+from sgwarp.kernels.native import Seen
 from sgwarp.kernels.transmittance import LaneIds, Lanes
 from sgwarp.ops.lift import LiftSums, lift_view  # only to compare with; importing it starts Warp without its banner
 
@@ -365,16 +375,20 @@ plt.show()
 # $T_i = \prod_{j<i} (1 - \alpha_j)$ is the light that the Gaussians in front let through (eq. 1). This is the *lane*
 # schedule, made for CPUs: 16 pixels of a row are one vector. `make_composite_colors(True, False)` keeps both depths,
 # but not what training needs (`None`); the rest is scratch, one slot for each host thread: the state of every row, and
-# 32 fragments at a time with the rows that they reach.
+# 32 splats at a time as the tile sees them, with the rows that they reach.
 
 
 # %%
+def batch():
+    """Scratch for 32 splats as a tile sees them, and for the rows that each reaches: 16 bits, two in an integer."""
+    return wp.zeros((1, 32), dtype=Seen), wp.zeros((1, 16), dtype=int)
+
+
 def composite(lists):
     """Colours, transmittance, sum of alpha T z and the depth of the surface."""
     outputs = [wp.zeros((HEIGHT, WIDTH), dtype=kind) for kind in (wp.vec3, float, float, float)]
     state = wp.zeros((1, 16, 6), dtype=Lanes)
-    batch = [wp.zeros((1, 32), dtype=binning.Fragment), wp.zeros((1, 2, 32), dtype=int)]
-    inputs = [0, 0, lists["offsets"], lists["listed"], lists["splats"], knobs, WIDTH, HEIGHT, state, *batch]
+    inputs = [0, 0, lists["offsets"], lists["listed"], lists["splats"], knobs, WIDTH, HEIGHT, state, *batch()]
     wp.launch(compositing_lanes.make_composite_colors(True, False), TILES, inputs, [*outputs, None, None])
     return [output.numpy() for output in outputs]
 
@@ -511,11 +525,10 @@ def composite_features(lists, features):
     """Blend up to 16 channels per Gaussian, [N, C], into an image [H, W, C]."""
     blended = wp.zeros((HEIGHT, WIDTH, features.shape[1]), dtype=float)
     transmittance = wp.zeros((HEIGHT, WIDTH), dtype=float)
-    batch = (1, 16, compositing_lanes.BATCH)
-    scratch = [wp.zeros((1, 16, 17), dtype=Lanes), wp.zeros(batch, dtype=Lanes), wp.zeros(batch, dtype=int)]
+    scratch = [wp.zeros((1, 16, 17), dtype=Lanes), *batch()]
     slices = in_lanes(features).reshape((N, 1, 1))
     inputs = [0, 0, lists["offsets"], lists["listed"], lists["splats"], slices, 0, knobs, WIDTH, HEIGHT, *scratch]
-    wp.launch(compositing_lanes.make_composite_features(1, False), TILES, inputs, [blended, transmittance, None])
+    wp.launch(compositing_features.make_composite_features(1, False), TILES, inputs, [blended, transmittance, None])
     return blended.numpy()
 
 
