@@ -62,12 +62,8 @@ FORWARD = (
     if (RECORD) last = row_state[planes - 1];
     for (; left; left &= left - 1) {
         const int b = __builtin_ctz(left);
-        const auto& seen = batch.data[slot * 32 + b];
-        const auto& s = seen.splat;
-        const float middle = reinterpret_cast<const float*>(&seen.middle)[row];
-        const float top = reinterpret_cast<const float*>(&seen.top)[row];
-        const Row weight = opacity(offsets * s.a + middle, top, knobs) * T, behind = T - weight;
-        const Row w = behind > knobs.transmittance_min ? weight : zero;
+        const auto& s = batch.data[slot * 32 + b].splat;
+        const Row before = T, w = take_seen(batch.data[slot * 32 + b], row, knobs, T);
         red += w * s.color[0];
         green += w * s.color[1];
         blue += w * s.color[2];
@@ -75,10 +71,9 @@ FORWARD = (
         if (RECORD) last = w > zero ? one * place : last;
         if (DEPTH) {
             z += w * s.depth;
-            const Row here = T - w <= knobs.surface_transmittance ? one * (RECORD ? place : s.depth) : surface;
-            surface = T > knobs.surface_transmittance ? here : surface;
+            const Row here = before - w <= knobs.surface_transmittance ? one * (RECORD ? place : s.depth) : surface;
+            surface = before > knobs.surface_transmittance ? here : surface;
         }
-        T = behind > knobs.transmittance_min ? behind : -__builtin_elementwise_abs(T);
     }
     row_state[0] = T, row_state[1] = red, row_state[2] = green, row_state[3] = blue;
     if (DEPTH) row_state[4] = z, row_state[5] = surface;

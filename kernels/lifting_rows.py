@@ -18,9 +18,7 @@ WALK = """
     *reinterpret_cast<Row*>(middle_of) = middles, *reinterpret_cast<Row*>(top_of) = tops;
     const auto weight_of = [&](int row) -> Row {
         Row& T = *reinterpret_cast<Row*>(state.data + slot * 16 + row);
-        const Row weight = opacity(offsets * s.a + middle_of[row], top_of[row], knobs) * T, behind = T - weight;
-        T = behind > knobs.transmittance_min ? behind : -__builtin_elementwise_abs(T);
-        return behind > knobs.transmittance_min ? weight : zero;
+        return take(opacity(offsets * s.a + middle_of[row], top_of[row], knobs), knobs, T);
     };
 """
 

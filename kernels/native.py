@@ -105,6 +105,19 @@ HELPERS = """
         const Row level = top - u * u;
         return level < knobs.alpha_min_level ? zero : __builtin_elementwise_min(exp2(level), one * knobs.alpha_max);
     };
+    // alpha T, zero where a pixel is closed (T < 0) or would close, as in `transmittance.py`; T becomes what is left.
+    const auto take = [&](Row alpha, const auto& knobs, Row& T) -> Row {
+        const Row weight = alpha * T, behind = T - weight;
+        const Row w = behind > knobs.transmittance_min ? weight : zero;
+        T = behind > knobs.transmittance_min ? behind : -__builtin_elementwise_abs(T);
+        return w;
+    };
+    // The same for a splat that was seen before.
+    const auto take_seen = [&](const auto& seen, int row, const auto& knobs, Row& T) -> Row {
+        const float middle = reinterpret_cast<const float*>(&seen.middle)[row];
+        const float top = reinterpret_cast<const float*>(&seen.top)[row];
+        return take(opacity(offsets * seen.splat.a + middle, top, knobs), knobs, T);
+    };
 """
 
 

@@ -34,7 +34,7 @@ import sgwarp as sg
 from sgwarp.kernels import (
     binning,
     compositing_block,
-    compositing_features,
+    compositing_lanes_features,
     compositing_lanes,
     harmonics,
     lifting,
@@ -528,7 +528,9 @@ def composite_features(lists, features):
     scratch = [wp.zeros((1, 16, 17), dtype=Lanes), *batch()]
     slices = in_lanes(features).reshape((N, 1, 1))
     inputs = [0, 0, lists["offsets"], lists["listed"], lists["splats"], slices, 0, knobs, WIDTH, HEIGHT, *scratch]
-    wp.launch(compositing_features.make_composite_features(1, False), TILES, inputs, [blended, transmittance, None])
+    wp.launch(
+        compositing_lanes_features.make_composite_features(1, False), TILES, inputs, [blended, transmittance, None]
+    )
     return blended.numpy()
 
 

@@ -9,7 +9,7 @@ import warp as wp
 from torch import Tensor
 
 from sgwarp.errors import InputError
-from sgwarp.kernels import compositing_block, compositing_features, compositing_lanes
+from sgwarp.kernels import compositing_block, compositing_lanes_features, compositing_lanes
 from sgwarp.kernels.native import Seen
 from sgwarp.kernels.transmittance import Lanes
 from sgwarp.ops import tiles
@@ -266,7 +266,7 @@ def _composite_wide(
     first = 0
     while first < count:
         width_of_pass = WIDE_PASS if count - first >= WIDE_PASS else 1
-        kernel = compositing_features.make_composite_features(width_of_pass, record)
+        kernel = compositing_lanes_features.make_composite_features(width_of_pass, record)
         state = lane_scratch("state", TILE_ROWS, 1 + LANE * width_of_pass + record, device)
         scratches = [state, *batch_scratch(device)]
         inputs = [*lists.arrays(), view(slices.unsqueeze(2), Lanes), first, *tail, *scratches]

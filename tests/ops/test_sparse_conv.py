@@ -7,6 +7,7 @@ import torch
 
 from sgwarp.errors import InputError
 from sgwarp.ops import reference_sparse
+from sgwarp.ops.launch import get_threads, set_threads
 from sgwarp.ops.sparse_conv import sparse_conv
 from sgwarp.ops.voxels import KernelMap, coarsen, kernel_map, pack_voxels, unpack_voxels
 
@@ -56,6 +57,46 @@ def test_convolution_is_the_dense_one(side, step, stride):
     assert_same(ours, theirs, (features, weight))
 
 
+def assert_near(ours, theirs, inputs, wide_inputs) -> None:
+    """Single against double precision: values, and gradients of a random projection of them."""
+    assert ours.dtype == torch.float32
+    assert largest_difference(ours, theirs) < 2e-6
+    seed = torch.randn(theirs.shape, dtype=torch.float64, generator=torch.Generator().manual_seed(9))
+    mine = torch.autograd.grad((ours * seed.float()).sum(), inputs)
+    other = torch.autograd.grad((theirs * seed).sum(), wide_inputs)
+    for a, b in zip(mine, other, strict=True):
+        assert largest_difference(a, b) < 2e-6
+
+
+@pytest.mark.parametrize("channels", [(32, 32), (10, 64), (96, 160), (64, 40)])
+@pytest.mark.parametrize(("side", "step", "stride"), CASES)
+def test_single_precision_is_the_dense_one(side, step, stride, channels):
+    """A kernel of its own where both widths are multiples of 32; several blocks of targets and chunks of pairs."""
+    sources = keys_of(900, 6)
+    targets = sources if stride == 1 else coarsen(sources, stride)
+    wide = inputs(len(sources), side, channels)
+    narrow = [t.detach().float().requires_grad_() for t in wide]
+    both = unpack_voxels(sources), unpack_voxels(targets)
+    theirs = reference_sparse.convolve(*wide, *both, side, step)
+    assert_near(sparse_conv(*narrow, kernel_map(sources, targets, side, step)), theirs, narrow, wide)
+
+
+def test_single_precision_has_the_same_bits_for_any_number_of_threads():
+    keys = keys_of(4000, 12)
+    pairs = kernel_map(keys, keys, 3)
+    features, weight = (t.detach().float().requires_grad_() for t in inputs(len(keys), 3, (64, 96)))
+    before, results = get_threads(), []
+    try:
+        for threads in (1, 2, 5):
+            set_threads(threads)
+            y = sparse_conv(features, weight, pairs)
+            results.append([y.detach(), *torch.autograd.grad(y.square().sum(), (features, weight))])
+    finally:
+        set_threads(before)
+    for other in results[1:]:
+        assert all(torch.equal(a, b) for a, b in zip(results[0], other, strict=True))
+
+
 @pytest.mark.parametrize("stride", [2, 4])
 def test_transposed_convolution_is_the_dense_one(stride):
     """From level `stride` to level `stride / 2`, as a U-Net goes up."""
@@ -99,18 +140,20 @@ def test_a_voxel_without_neighbours_keeps_the_centre_weight():
     assert torch.equal(sparse_conv(features, weight, kernel_map(key, key, 3)), features @ weight[13])
 
 
-def test_nothing_in_gives_nothing_out():
+@pytest.mark.parametrize(("channels", "dtype"), [((5, 7), torch.float64), ((32, 64), torch.float32)])
+def test_nothing_in_gives_nothing_out(channels, dtype):
     none = pack_voxels(torch.zeros(0, 4, dtype=torch.int64))
-    features, weight = inputs(0, 3)
+    features, weight = inputs(0, 3, channels, dtype)
     y = sparse_conv(features, weight, kernel_map(none, none, 3))
-    assert y.shape == (0, 7)
+    assert y.shape == (0, channels[1])
     y.sum().backward()
     assert bool((weight.grad == 0).all())
 
 
-def test_a_row_of_nan_reaches_its_neighbours_and_nobody_else():
+@pytest.mark.parametrize("channels", [(5, 7), (32, 64)])
+def test_a_row_of_nan_reaches_its_neighbours_and_nobody_else(channels):
     keys = pack_voxels(torch.tensor([[0, 0, 0, 0], [0, 0, 0, 1], [0, 0, 0, 2], [1, 0, 0, 0]]))
-    features, weight = inputs(4, 3, dtype=torch.float32)
+    features, weight = inputs(4, 3, channels, dtype=torch.float32)
     features = features.detach().clone()
     features[0] = float("nan")
     y = sparse_conv(features, weight, kernel_map(keys, keys, 3))
@@ -182,7 +225,9 @@ def spconv_layer(kind: str, weight: torch.Tensor, side: int):
     return spconv, layer
 
 
-@pytest.mark.parametrize(("kind", "side", "stride"), [("SubMConv3d", 3, 1), ("SparseConv3d", 2, 2)])
+@pytest.mark.parametrize(
+    ("kind", "side", "stride"), [("SubMConv3d", 3, 1), ("SubMConv3d", 5, 1), ("SparseConv3d", 2, 2)]
+)
 def test_convolution_is_that_of_spconv(kind, side, stride):
     keys = keys_of(3000, 12)
     coordinates = unpack_voxels(keys)

@@ -40,18 +40,14 @@ FORWARD = (
     for (; left; left &= left - 1) {
         const int b = __builtin_ctz(left);
         const auto& seen = batch.data[slot * 32 + b];
-        const auto& s = seen.splat;
-        const float middle = reinterpret_cast<const float*>(&seen.middle)[row];
-        const float top = reinterpret_cast<const float*>(&seen.top)[row];
-        const Row weight = opacity(offsets * s.a + middle, top, knobs) * T, behind = T - weight;
-        const Row w = behind > knobs.transmittance_min ? weight : zero;
-        T = behind > knobs.transmittance_min ? behind : -__builtin_elementwise_abs(T);
+        const Row w = take_seen(seen, row, knobs, T);
         if (RECORD) {
             const float place = order + b;
             last = w > zero ? one * place : last;
         }
         weights[count] = w;
-        owners[count] = reinterpret_cast<const float*>(features.data + s.gaussian * features.shape[1] + first_slice);
+        const auto* const x = features.data + seen.splat.gaussian * features.shape[1] + first_slice;
+        owners[count] = reinterpret_cast<const float*>(x);
         count += bits(w > zero) != 0;
     }
     row_state[0] = T;
