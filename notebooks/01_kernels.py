@@ -34,8 +34,8 @@ import sgwarp as sg
 from sgwarp.kernels import (
     binning,
     compositing_block,
-    compositing_lanes_features,
     compositing_lanes,
+    compositing_lanes_features,
     harmonics,
     lifting,
     lifting_lanes,

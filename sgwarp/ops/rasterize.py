@@ -9,7 +9,7 @@ import warp as wp
 from torch import Tensor
 
 from sgwarp.errors import InputError
-from sgwarp.kernels import compositing_block, compositing_lanes_features, compositing_lanes
+from sgwarp.kernels import compositing_block, compositing_lanes, compositing_lanes_features
 from sgwarp.kernels.native import Seen
 from sgwarp.kernels.transmittance import Lanes
 from sgwarp.ops import tiles
