@@ -9,6 +9,7 @@ import torch
 from torch import Tensor
 
 from sgwarp.errors import InputError
+from sgwarp.ops.deformation import deformed
 from sgwarp.ops.harmonics import harmonics_basis
 from sgwarp.scene import Gaussians
 
@@ -78,7 +79,6 @@ class Augmentation:
         scale: Smallest and largest factor.
         mirror: Mirror each horizontal axis in half of the cases.
         elastic: Pairs of granularity [m] and magnitude [m] of smooth random displacements; in 95 % of the cases.
-            Centres move, shapes do not.
         shift: Largest shift along each axis, in voxels: it changes which points share a voxel.
     """
 
@@ -93,10 +93,10 @@ class Augmentation:
     def __call__(self, gaussians: Gaussians, voxel: float, generator: torch.Generator) -> Gaussians:
         """A changed scene; the same generator state gives the same changes."""
         if self.elastic and _uniform(generator, 0.0, 1.0) < 0.95:
-            means = gaussians.means
             for granularity, magnitude in self.elastic:
-                means = means + bend(means, granularity, magnitude, generator)
-            gaussians = replace(gaussians, means=means)
+                moved, gradient = bend(gaussians.means, granularity, magnitude, generator)
+                jacobians = torch.eye(3, device=gradient.device) + gradient
+                gaussians = deformed(gaussians, gaussians.means + moved, jacobians)
         A = torch.eye(3, dtype=torch.float64)
         for axis in (*(a for a in range(3) if a != self.up), self.up):
             most = self.turn if axis == self.up else self.tilt
@@ -109,14 +109,17 @@ class Augmentation:
         return replace(gaussians, means=gaussians.means + shift.to(gaussians.device))
 
 
-def bend(points: Tensor, granularity: float, magnitude: float, generator: torch.Generator) -> Tensor:
-    """Smooth random displacements [m] of points [N, 3]: noise on a lattice, blurred, interpolated linearly.
+def bend(points: Tensor, granularity: float, magnitude: float, generator: torch.Generator) -> tuple[Tensor, Tensor]:
+    """Smooth random displacements of points [N, 3]: noise on a lattice, blurred, interpolated linearly.
 
     Args:
         points: [m], [N, 3]; where one is not finite, so is its displacement.
         granularity: Spacing of the lattice [m].
         magnitude: Standard deviation of the noise before it is blurred [m].
         generator: Of the noise.
+
+    Returns:
+        Displacements u [m], [N, 3], and their derivatives, [N, 3, 3] with du_i / dx_j in row i and column j.
     """
     noise = torch.randn(LATTICE, LATTICE, LATTICE, 3, generator=generator) * magnitude
     for axis in (0, 1, 2, 0, 1, 2):
@@ -126,13 +129,17 @@ def bend(points: Tensor, granularity: float, magnitude: float, generator: torch.
     corner = place.floor()
     within = place - corner
     corner = torch.where(torch.isfinite(corner), corner.remainder(LATTICE), 0.0).long()
-    moved = torch.zeros_like(points)
+    moved, gradient = torch.zeros_like(points), points.new_zeros(len(points), 3, 3)
     for number in range(8):
         step = torch.tensor([number >> 2, number >> 1 & 1, number & 1], device=points.device)
-        share = torch.where(step.bool(), within, 1.0 - within).prod(dim=1, keepdim=True)
+        shares = torch.where(step.bool(), within, 1.0 - within)
         x, y, z = ((corner + step) % LATTICE).unbind(1)
-        moved += share * noise[x, y, z]
-    return moved
+        value = noise[x, y, z]
+        moved += shares.prod(dim=1, keepdim=True) * value
+        for axis in range(3):
+            others = shares[:, [a for a in range(3) if a != axis]].prod(dim=1, keepdim=True)
+            gradient[:, :, axis] += (2 * step[axis] - 1) * others * value
+    return moved, gradient / granularity
 
 
 def _rotation(axis: int, angle: float) -> Tensor:

@@ -1,6 +1,7 @@
 """Input channels, voxels of a scene, and augmentation in which everything follows the centres."""
 
 import math
+from dataclasses import replace
 
 import pytest
 import torch
@@ -9,6 +10,7 @@ from sgwarp.errors import InputError
 from sgwarp.nn.augment import Augmentation, bend, transformed
 from sgwarp.nn.inputs import INPUT_CHANNELS, input_features, voxelize
 from sgwarp.ops import reference
+from sgwarp.ops.deformation import deformed
 from sgwarp.ops.harmonics import harmonics_basis
 from sgwarp.render import render
 from sgwarp.scene import Camera, Gaussians
@@ -209,10 +211,56 @@ def test_bending_is_smooth_and_has_no_border():
     g = torch.Generator().manual_seed(0)
     line = torch.zeros(4000, 3)
     line[:, 0] = torch.linspace(-40, 40, 4000)
-    moved = bend(line, 0.8, 1.6, g)
+    moved, _ = bend(line, 0.8, 1.6, g)
     assert 0.02 < float(moved.std()) < 1.6
     assert float((moved[1:] - moved[:-1]).norm(dim=1).max()) < 0.05  # over 2 cm
     far = torch.tensor([[math.nan, 0, 0], [1e9, 0, 0], [-1e9, 1, 1]])
-    out = bend(far, 0.2, 0.4, g)
+    out, _ = bend(far, 0.2, 0.4, g)
     assert torch.isnan(out[0]).all()
     assert torch.isfinite(out[1:]).all()
+
+
+def test_derivatives_of_the_bending_are_those_of_finite_differences():
+    points = 8 * torch.rand(200, 3, generator=torch.Generator().manual_seed(3), dtype=torch.float64)
+    points = points[((points / 0.8).frac() - 0.5).abs().amax(dim=1) < 0.49]  # not where a cell of the lattice ends
+
+    def moved(p: torch.Tensor) -> torch.Tensor:
+        return bend(p, 0.8, 1.6, torch.Generator().manual_seed(5))[0]
+
+    _, gradient = bend(points, 0.8, 1.6, torch.Generator().manual_seed(5))
+    for axis in range(3):
+        step = 1e-4 * torch.eye(3, dtype=torch.float64)[axis]
+        difference = (moved(points + step) - moved(points - step)) / 2e-4
+        torch.testing.assert_close(gradient[:, :, axis], difference, rtol=0, atol=1e-7)
+    assert float(gradient.abs().max()) > 0.1
+
+
+@pytest.mark.parametrize("thin", [1.0, 1e-3])
+def test_bent_covariances_are_those_of_the_jacobian(thin):
+    gaussians = scene(300)
+    gaussians = replace(gaussians, scales=gaussians.scales * torch.tensor([1.0, 1.0, thin]))
+    jacobians = torch.eye(3) + 0.3 * torch.randn(300, 3, 3, generator=torch.Generator().manual_seed(0))
+    bent = deformed(gaussians, gaussians.means, jacobians)
+
+    expected = jacobians.double() @ covariances(gaussians) @ jacobians.double().transpose(1, 2)
+    size = expected.diagonal(dim1=1, dim2=2).sum(1)
+    error = (covariances(bent) - expected).abs().amax(dim=(1, 2)) / size
+    assert float(error.max()) < 1e-5
+    # The smallest axis too, of which the covariance says little: its share of the volume.
+    volume = torch.linalg.det(jacobians.double()).abs() * gaussians.scales.double().prod(dim=1)
+    torch.testing.assert_close(bent.scales.double().prod(dim=1), volume, rtol=5e-3, atol=0)
+
+
+def test_elastic_augmentation_bends_shapes_with_their_centres():
+    gaussians = scene(400)
+    plain = Augmentation(up=1, tilt=0, turn=0, scale=(1.0, 1.0), mirror=False, shift=0)
+    bent = plain(gaussians, 0.02, torch.Generator().manual_seed(1))
+    change = bent.scales.prod(dim=1) / gaussians.scales.prod(dim=1)
+    assert float((bent.means - gaussians.means).norm(dim=1).mean()) > 0.01
+    assert 0.02 < float(change.log().std()) < 1
+
+
+def test_deformations_that_do_not_fit_are_refused():
+    gaussians = scene(5)
+    with pytest.raises(InputError, match=r"expected means \[5, 3\]"):
+        deformed(gaussians, gaussians.means[1:], torch.eye(3).expand(5, 3, 3))
