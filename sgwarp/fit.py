@@ -5,8 +5,10 @@ from __future__ import annotations
 import dataclasses
 import math
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -194,19 +196,28 @@ class _Run:
                 return False
             if self.step % REPORT_EVERY == 0:
                 report(self.step, settings.steps, self._text((self.step - first) / (time.perf_counter() - began)))
-            with self.log.stage("fit"):
-                before = time.perf_counter()
-                self._take_step()
-                self.seconds += time.perf_counter() - before
+            with self._timed():
+                refine = self._take_step()
+            # Before the refinement, as the reference does: it may have just made all Gaussians transparent.
             if self.step % settings.evaluate_every == 0 and self.step < settings.steps:
                 self.measure()
+            with self._timed():
+                refine()
             if checkpoint is not None and self.step % checkpoint_every == 0 and self.step < settings.steps:
                 with self.log.stage("checkpoint"):
                     self.save(checkpoint)
         report(self.step, settings.steps, self._text((self.step - first) / max(time.perf_counter() - began, 1e-9)))
         return True
 
-    def _take_step(self) -> None:
+    @contextmanager
+    def _timed(self) -> Iterator[None]:
+        with self.log.stage("fit"):
+            before = time.perf_counter()
+            yield
+            self.seconds += time.perf_counter() - before
+
+    def _take_step(self) -> Callable[[], None]:
+        """Look at one photograph and update the Gaussians; the result refines their set."""
         settings, model = self.settings, self.model
         index = view_at(settings.seed, self.step, len(self.photographs))
         photograph = self.photographs[index]
@@ -245,12 +256,12 @@ class _Run:
         if self.exposure is not None and colour_map is not None and colour_map.grad is not None:
             self.exposure.update(index, colour_map.grad, share)
         self.log.leave_out("updates_of_unseen_gaussians", len(model) - int(taken.sum()))
-        self.strategy.after_step(model, self.step + 1, gradients, taken, camera)
         value = float(loss.detach())
         self.loss = value if math.isnan(self.loss) else MEMORY * self.loss + (1 - MEMORY) * value
         self.step += 1
         if self.step % REPORT_EVERY == 0:
             self.psnr = psnr(image.detach(), truth)
+        return partial(self.strategy.after_step, model, self.step, gradients, taken, camera)
 
     def _background(self) -> Tensor | None:
         if self.settings.background == "black":

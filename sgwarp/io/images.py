@@ -151,7 +151,7 @@ def _decode(path: str | os.PathLike[str], data: bytes, flags: int) -> NDArray[An
     except cv2.error:
         pixels = None
     if pixels is None:
-        raise InputError(f"{path}: is not an image that OpenCV can read, or is damaged")
+        raise InputError(f"{path}: is not an image that OpenCV can read, or is damaged; save it again as PNG or JPEG")
     return pixels
 
 
