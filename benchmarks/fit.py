@@ -24,6 +24,7 @@ import torch
 
 import sgwarp as sg
 from benchmarks.room import FullRoom, label_iou
+from sgwarp.demo.build import SETTINGS as DEMO
 from sgwarp.fit import Fitted
 from sgwarp.fitting.photographs import read_photographs
 from sgwarp.fitting.report import write_contact_sheet
@@ -39,14 +40,13 @@ MARKS = (1000, 3000, 7000, 10_000)  # steps whose quality is quoted
 SPEED_STEPS = 200
 SHORT = 2000  # steps of the comparison of sparse and dense updates
 CAPS = (10_000, 30_000)  # beside the 100,000 of the long runs
-DEMO_CAP = 100_000  # of the scene that ships, with colours of degree 1: 25 bytes per Gaussian
 FITS = {
     "mcmc": FitSettings(steps=STEPS, strategy="mcmc", cap=100_000),
     "default": FitSettings(steps=STEPS, strategy="default", cap=100_000),
     **{f"cap {cap}": FitSettings(steps=STEPS, strategy="mcmc", cap=cap) for cap in CAPS},
     "sparse": FitSettings(steps=SHORT, strategy="mcmc", sparse=True),
     "dense": FitSettings(steps=SHORT, strategy="mcmc", sparse=False),
-    "demo": FitSettings(steps=STEPS, strategy="mcmc", cap=DEMO_CAP, sh_degree=1),
+    "demo": DEMO,
 }
 COLOURS = {"mcmc": "#2d6cb5", "default": "#d1495b"}
 

@@ -1,11 +1,13 @@
-"""Make the data of the demonstration from the full data set of the room: `python -m sgwarp.demo.build`.
+"""Make the data of the demonstration from the full data set of the room: `python -m sgwarp.demo.build [--scene FILE]`.
 
-Reads the folder `room` below $SGWARP_DATA: 60 rendered views with depth and label images, every eighth of them held
-out. The scene is made from the RGB-D of the others; a dozen of these and two held-out views are shipped.
+Reads the folder `room` below $SGWARP_DATA: 60 rendered views with points and label images, every eighth of them held
+out. The scene is fitted to the others, in about ten minutes, or was before; a dozen of them and two held-out views are
+shipped.
 """
 
 from __future__ import annotations
 
+import argparse
 import json
 import os
 from collections.abc import Sequence
@@ -17,27 +19,31 @@ from numpy.typing import NDArray
 
 from sgwarp.demo.data import CLASSES_FILE, FURNITURE, HELD_OUT, ROOM, SCENE_FILE
 from sgwarp.errors import InputError
-from sgwarp.from_depth import gaussians_from_depth
+from sgwarp.fit import fit
+from sgwarp.fitting.settings import FitSettings
 from sgwarp.io.atomic import atomic_path
 from sgwarp.io.images import read_ids, write_ids, write_rgb
-from sgwarp.io.scenes import save_gaussians
+from sgwarp.io.points import load_points
+from sgwarp.io.scenes import load_gaussians, save_gaussians
 from sgwarp.io.views import load_views
 from sgwarp.progress import show_progress
 from sgwarp.scene import View
 
-COUNT = 150_000  # Gaussians, 16 bytes each
+SETTINGS = FitSettings(steps=10_000, strategy="mcmc", cap=100_000, sh_degree=1)  # 25 bytes per Gaussian
 VIEWS = 12
 HOLD_OUT = 8  # every eighth view is held out
 SHOWN = ("0016", "0024")  # held-out views that are shipped: between them they show every object
 NEAR, SIMILAR = 0.5, 25.0  # of two views this close [m] that look the same way [degrees], one is enough
 
 
-def build_room(source: Path, out: Path) -> None:
+def build_room(source: Path, out: Path, scene: Path | None = None, settings: FitSettings = SETTINGS) -> None:
     """Write the scene, the posed photographs and the label images.
 
     Args:
-        source: Folder with transforms.json, images/, depth/ (uint16 millimetres), labels/ and classes.json.
+        source: Folder with transforms.json, its points, images/, labels/ and classes.json.
         out: Folder to write into.
+        scene: The views that are not held out, fitted before; None fits them.
+        settings: Of the fit.
 
     Raises:
         InputError: Something is missing in `source`.
@@ -46,11 +52,11 @@ def build_room(source: Path, out: Path) -> None:
     train = [view for index, view in enumerate(views) if index % HOLD_OUT]
     held_out = [view for view in views[::HOLD_OUT] if view.stem in SHOWN]
 
-    def depth(view: View) -> NDArray[np.float32]:
-        return read_ids(source / "depth" / f"{view.stem}.png").astype(np.float32) * np.float32(0.001)
-
-    with show_progress("gaussians") as progress:
-        gaussians = gaussians_from_depth(train, depth, count=COUNT, progress=progress)
+    if scene is None:
+        with show_progress("fit") as progress:
+            gaussians = fit(train, load_points(source), settings=settings, progress=progress).gaussians
+    else:
+        gaussians = load_gaussians(scene)
     save_gaussians(gaussians, out / SCENE_FILE)
     labels = {view.stem: read_ids(source / "labels" / f"{view.stem}.png") for view in views}
     lifted = choose_views(train, [labels[view.stem] for view in train], VIEWS)
@@ -97,8 +103,15 @@ def _write_json(path: Path, content: Any) -> None:
         temporary.write_text(json.dumps(content, indent=1) + "\n", encoding="utf-8")
 
 
-if __name__ == "__main__":
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--scene", type=Path, help="the fitted scene, if there is one already")
+    options = parser.parse_args()
     data = os.environ.get("SGWARP_DATA")
     if data is None:
         raise SystemExit("set SGWARP_DATA to the folder that holds room/")
-    build_room(Path(data) / "room", ROOM)
+    build_room(Path(data) / "room", ROOM, options.scene)
+
+
+if __name__ == "__main__":
+    main()
