@@ -163,6 +163,26 @@ def order_splats(
     order_splat(base + wp.tid(), order, splats, colors, ordered_out)
 
 
+SPANS = wp.constant(4)  # tile rows of a splat whose columns the counting pass keeps for the filling pass
+MOST_COLUMNS = wp.constant(256)  # of tiles, so that a column takes eight bits
+
+
+@wp.func
+def with_span(spans: wp.uint64, place: int, first: int, last: int) -> wp.uint64:
+    """Keep the columns of the splat's tile row number `place`, unless it is too far down."""
+    kept = spans
+    if place < SPANS:
+        kept = spans | (wp.uint64(first + (last << 8)) << wp.uint64(16 * place))
+    return kept
+
+
+@wp.func
+def span_of(spans: wp.uint64, place: int):
+    """First and last column that `with_span` kept."""
+    span = int((spans >> wp.uint64(16 * place)) & wp.uint64(0xFFFF))
+    return span & 255, span >> 8
+
+
 @wp.kernel
 def count_tiles(
     # In:
@@ -177,6 +197,7 @@ def count_tiles(
     ordered_out: wp.array[Splat],  # [V] in depth order, where all later passes read them
     tile_counts_out: wp.array2d[int],  # [slices, tiles] zeroed
     splat_counts_out: wp.array[int],  # [V] tiles that each splat touches
+    spans_out: wp.array[wp.uint64],  # [V] columns of its first tile rows
 ):
     """Bring the splats into depth order and count intersections per (slice, tile) and splat. One thread per slice."""
     s = base + wp.tid()
@@ -187,13 +208,16 @@ def count_tiles(
         splat = splats[order[k]]
         box_first, box_last = box_columns(splat, width)
         total = int(0)
+        spans = wp.uint64(0)
         first_row, last_row = tile_rows(splat, height)
         for row in range(first_row, last_row + 1):
             first, last = row_columns(splat, row, width, box_first, box_last)
             for column in range(first, last + 1):
                 tile_counts_out[s, row * columns + column] += 1
             total += wp.max(last - first + 1, 0)
+            spans = with_span(spans, row - first_row, first, last)
         splat_counts_out[k] = total
+        spans_out[k] = spans
 
 
 @wp.kernel
@@ -205,6 +229,7 @@ def fill_tiles(
     width: int,
     height: int,
     entries: wp.array[int],  # [V] first entry of each splat
+    spans: wp.array[wp.uint64],  # [V] from `count_tiles`
     # In and out:
     cursors: wp.array2d[int],  # [slices, tiles] next free place of each (slice, tile)
     # Out:
@@ -216,12 +241,13 @@ def fill_tiles(
     s = base + wp.tid()
     columns = (width + TILE - 1) / TILE
     for k in range(s * per_slice, wp.min((s + 1) * per_slice, splats.shape[0])):
-        splat = splats[k]
-        box_first, box_last = box_columns(splat, width)
         entry = entries[k]
-        first_row, last_row = tile_rows(splat, height)
+        first_row, last_row = tile_rows(splats[k], height)
         for row in range(first_row, last_row + 1):
-            first, last = row_columns(splat, row, width, box_first, box_last)
+            first, last = span_of(spans[k], wp.min(row - first_row, SPANS - 1))
+            if row - first_row >= SPANS or columns > MOST_COLUMNS:
+                box_first, box_last = box_columns(splats[k], width)
+                first, last = row_columns(splats[k], row, width, box_first, box_last)
             for column in range(first, last + 1):
                 tile = row * columns + column
                 place = cursors[s, tile]

@@ -317,7 +317,9 @@ def bin_splats(camera, splats, status, depths):
     wp.launch(harmonics.evaluate_harmonics, count, [0, order, means, coefficients, 1, camera], [colors])
     tile_counts, splat_counts = wp.zeros((1, TILES), dtype=int), wp.zeros(count, dtype=int)
     sizes = [count, WIDTH, HEIGHT]
-    wp.launch(binning.count_tiles, 1, [0, order, splats, colors, *sizes], [ordered, tile_counts, splat_counts])
+    spans = wp.zeros(count, dtype=wp.uint64)  # columns that a splat touches, kept from counting for filling
+    outputs = [ordered, tile_counts, splat_counts, spans]
+    wp.launch(binning.count_tiles, 1, [0, order, splats, colors, *sizes], outputs)
     offsets, entries = starts(tile_counts.numpy()[0]), starts(splat_counts.numpy())
     listed, places, tiles = (wp.zeros(int(offsets[-1]), dtype=int) for _ in range(3))
     lists = {
@@ -330,7 +332,7 @@ def bin_splats(camera, splats, status, depths):
         "tiles": tiles,  # [I] tile of each entry
     }
     cursors = wp.array(offsets[None, :-1].copy())
-    wp.launch(binning.fill_tiles, 1, [0, ordered, *sizes, lists["entries"], cursors], [listed, places, tiles])
+    wp.launch(binning.fill_tiles, 1, [0, ordered, *sizes, lists["entries"], spans, cursors], [listed, places, tiles])
     return lists
 
 

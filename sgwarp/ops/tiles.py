@@ -237,7 +237,8 @@ def bin_by_counting(
     sizes = [per_slice, camera.width, camera.height]
     splats = as_splats(memory)
     inputs = [view(order, wp.int32), projected.splats, colors, *sizes]
-    outputs = [splats, view(tile_counts, wp.int32), view(splat_counts, wp.int32)]
+    spans = view(scratch("spans", count, torch.int64, device), wp.uint64)
+    outputs = [splats, view(tile_counts, wp.int32), view(splat_counts, wp.int32), spans]
     launch(binning.count_tiles, SLICES, inputs, outputs, device=device, chunk=1)
     entries, total = _first_places(splat_counts)
     # Tile by tile, and within a tile slice by slice, so that each slice continues where the one in front ended.
@@ -249,7 +250,9 @@ def bin_by_counting(
         for name, wanted in (("listed", True), ("places", places), ("tiles", tiles))
     )
     outputs = [view(t, wp.int32) for t in (cursors, listed, places_of, tiles_of)]
-    launch(binning.fill_tiles, SLICES, [splats, *sizes, view(entries, wp.int32)], outputs, device=device, chunk=1)
+    launch(
+        binning.fill_tiles, SLICES, [splats, *sizes, view(entries, wp.int32), spans], outputs, device=device, chunk=1
+    )
     return TileLists(order, memory, offsets, listed, entries, places_of, tiles_of)
 
 
