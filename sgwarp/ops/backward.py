@@ -10,7 +10,12 @@ import warp as wp
 from torch import Tensor
 from torch.nn.functional import pad
 
-from sgwarp.kernels import compositing_block_backward, compositing_lanes_backward, harmonics_backward
+from sgwarp.kernels import (
+    compositing_block_backward,
+    compositing_lanes_backward,
+    harmonics_backward,
+    projection_lanes,
+)
 from sgwarp.kernels import projection_backward as kernels
 from sgwarp.kernels.compositing_lanes_backward import MOMENTS, row_columns
 from sgwarp.kernels.lifting import sum_rows
@@ -229,7 +234,11 @@ def project_backward(
         view(result.means2d, wp.vec2),
         view(result.poses, wp.float32),
     ]
-    launch(kernels.project_backward, n, inputs, outputs, device=device)
+    if device.type == "cuda":
+        launch(kernels.project_backward, n, inputs, outputs, device=device)
+    else:
+        groups = -(-n // projection_lanes.GROUP)
+        launch(projection_lanes.project_groups_backward, groups, inputs, outputs, device=device)
     return result
 
 

@@ -10,7 +10,7 @@ import warp as wp
 from torch import Tensor
 
 from sgwarp.errors import InputError
-from sgwarp.kernels import binning, harmonics, projection
+from sgwarp.kernels import binning, harmonics, projection, projection_lanes
 from sgwarp.kernels.gaussian import Pinhole, Splat
 from sgwarp.ops.launch import launch, launch_plain, scratch, view
 from sgwarp.ops.settings import RasterSettings
@@ -133,7 +133,7 @@ def knobs(settings: RasterSettings) -> projection.Knobs:
 
 
 def project(gaussians: Gaussians, camera: Camera, settings: RasterSettings) -> Projected:
-    """Project every Gaussian; one kernel thread each."""
+    """Project every Gaussian."""
     n, device = len(gaussians), gaussians.device
     splats = as_splats(splat_memory(n, device, "splats"))
     status = scratch("status", n, torch.uint8, device)
@@ -147,7 +147,10 @@ def project(gaussians: Gaussians, camera: Camera, settings: RasterSettings) -> P
         knobs(settings),
     ]
     outputs = [splats, view(status, wp.uint8), view(depths, wp.float32)]
-    launch(projection.project_gaussians, n, inputs, outputs, device=device)
+    if device.type == "cuda":
+        launch(projection.project_gaussians, n, inputs, outputs, device=device)
+    else:
+        launch(projection_lanes.project_groups, -(-n // projection_lanes.GROUP), inputs, outputs, device=device)
     # The kernel reads geometry and opacity only. On CUDA it is cheaper to look at all than to wait for the answer.
     if device.type == "cuda" or gaussians.colors_may_be_non_finite:
         status.masked_fill_(~gaussians.finite, int(projection.NON_FINITE))
