@@ -30,11 +30,33 @@ def deform_shapes(
     largest = wp.max(size)
     if largest == 0.0:
         quats_out[i] = quats[i]
-        scales_out[i] = scale
+        scales_out[i] = wp.vec3(0.0, 0.0, 0.0)
         return
     axes, values, _right = wp.svd3(root / largest)
-    if wp.determinant(axes) < 0.0:
-        axes = -axes
-    turn = wp.quat_from_matrix(axes)
-    quats_out[i] = wp.vec4(turn[3], turn[0], turn[1], turn[2])
-    scales_out[i] = largest * wp.abs(values)
+    # The decomposition sorts; each axis goes back to the place and the direction that it turned away from least, so
+    # that a map close to the identity leaves quaternion and scales where they were.
+    old = rotation_from_quaternion(quats[i])
+    near = wp.transpose(old) * axes  # cosines of old (row) and new (column) axes
+    taken = wp.vec3(0.0, 0.0, 0.0)
+    turned = wp.mat33()
+    kept = wp.vec3()
+    for column in range(3):
+        best = int(-1)
+        closest = float(-1.0)
+        for other in range(3):
+            cosine = wp.abs(near[column, other])
+            if taken[other] == 0.0 and cosine > closest:
+                closest = cosine
+                best = other
+        taken[best] = 1.0
+        kept[column] = largest * wp.abs(values[best])
+        direction = wp.where(near[column, best] < 0.0, -1.0, 1.0)
+        for row in range(3):
+            turned[row, column] = direction * axes[row, best]
+    if wp.determinant(turned) < 0.0:  # a mirrored axis is the same ellipsoid's
+        for row in range(3):
+            turned[row, 2] = -turned[row, 2]
+    turn = wp.quat_from_matrix(turned)
+    quat = wp.vec4(turn[3], turn[0], turn[1], turn[2])
+    quats_out[i] = wp.where(wp.dot(quat, quats[i]) < 0.0, -quat, quat)
+    scales_out[i] = kept

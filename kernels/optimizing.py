@@ -1,8 +1,9 @@
 """Fitting a scene: Adam on the parameters of those Gaussians that a view has seen, and noise on the rest of the way.
 
-One thread per Gaussian, the same kernels on CPU and CUDA. A Gaussian that no pixel saw has no gradient; its parameters
-and moments stay as they are, so that a step costs what the view shows and not what the scene holds. Each counts its
-own steps, so that bias correction is right for Gaussians that are young or seldom seen.
+One thread per Gaussian, the same kernels on CPU and CUDA. A Gaussian that no pixel saw has no gradient, but Adam would
+still move it: along what is left of its mean gradient, while the mean of the squares decays. Such steps are not taken,
+so that a step costs what the view shows and not what the scene holds; when the Gaussian is seen again, it makes up for
+all of them at once. The sum of the moves has a closed form, because their size falls geometrically.
 """
 
 import warp as wp
@@ -24,6 +25,41 @@ STEEPNESS = wp.constant(100.0)
 OPAQUE = wp.constant(0.17)  # here exp(-STEEPNESS (opacity - 0.005)) is below float32's resolution of 1
 
 
+UNSEEN = wp.constant(1)  # takes the step without a gradient
+SEEN = wp.constant(3)
+YOUNG = wp.constant(100)  # steps after which the bias of the mean gradient is gone
+
+
+@wp.func
+def waited_moves(age: int, waited: int) -> wp.vec2:
+    """Adam's next `waited` moves without a gradient, added up; and with a constant one, what comes of it.
+
+    The mean gradient of step s is (beta_1^s first + (1 - beta_1^s) constant) / (1 - beta_1^(age + s)), the mean square
+    beta_2^s second / (1 - beta_2^(age + s)). First come the moves in units of first / sqrt(second), then the sum of the
+    weights of the constant.
+    """
+    ratio = BETA_1 / wp.sqrt(BETA_2)
+    count = float(waited)
+    if age >= YOUNG:
+        bias = 1.0 - wp.pow(BETA_2, float(age + wp.min(waited, 8)))
+        falling = wp.sqrt(bias) * ratio * (1.0 - wp.pow(ratio, count)) / (1.0 - ratio)
+        return wp.vec2(falling, count - BETA_1 * (1.0 - wp.pow(BETA_1, count)) / (1.0 - BETA_1))
+    total = wp.vec2(0.0, 0.0)
+    first = wp.pow(BETA_1, float(age))
+    young = first
+    second = wp.pow(BETA_2, float(age))
+    size = float(1.0)
+    looked_at = wp.min(waited, 200)
+    for _ in range(looked_at):
+        first *= BETA_1
+        second *= BETA_2
+        size *= ratio
+        total[0] = total[0] + size * wp.sqrt(1.0 - second) / (1.0 - first)
+        total[1] = total[1] + (1.0 - first / young) / (1.0 - first)
+    total[1] = total[1] + float(waited - looked_at)
+    return total
+
+
 @wp.kernel
 def count_steps(
     # In:
@@ -32,26 +68,39 @@ def count_steps(
     sh: wp.array2d[wp.vec3],  # [N, K] gradient
     every: int,  # 1 = all take a step, seen or not
     # Out:
-    steps_out: wp.array[int],  # [N] added to
-    taken_out: wp.array[wp.uint8],  # [N] 1 = takes this step
+    steps_out: wp.array[int],  # [N] since the Gaussian came, added to
+    skipped_out: wp.array[int],  # [N] of these, how many it waits for; changed
+    taken_out: wp.array[wp.uint8],  # [N] 0, UNSEEN or SEEN
+    waited_out: wp.array[int],  # [N] steps to make up for, where this one is taken
+    moves_out: wp.array[wp.vec2],  # [N] `waited_moves` of them
 ):
     """Who takes this step: a Gaussian that changes a pixel has a gradient of its opacity or of its colour."""
     i = base + wp.tid()
     v = sh[i, 0]
     seen = opacities[i] != 0.0 or v[0] != 0.0 or v[1] != 0.0 or v[2] != 0.0
-    if seen or every != 0:
-        steps_out[i] = steps_out[i] + 1
-        taken_out[i] = wp.uint8(1)
-    else:
+    age = steps_out[i]
+    steps_out[i] = age + 1
+    if not seen and every == 0:
+        skipped_out[i] = skipped_out[i] + 1
         taken_out[i] = wp.uint8(0)
+        return
+    waited = skipped_out[i]
+    skipped_out[i] = 0
+    taken_out[i] = wp.uint8(wp.where(seen, SEEN, UNSEEN))
+    waited_out[i] = waited
+    moves_out[i] = wp.vec2(0.0, 0.0)
+    if waited > 0:
+        moves_out[i] = waited_moves(age - waited, waited)
 
 
 @wp.kernel
 def update_rows(
     # In:
     base: int,  # first Gaussian of this launch
-    taken: wp.array[wp.uint8],  # [N] 1 = takes this step
-    steps: wp.array[int],  # [N] including this one
+    taken: wp.array[wp.uint8],  # [N] 0 = does not take this step
+    steps: wp.array[int],  # [N] since the Gaussian came, including this one
+    waited: wp.array[int],  # [N] steps before this one that are still to be taken
+    moves: wp.array[wp.vec2],  # [N] `waited_moves` of them
     gradient: wp.array2d[float],  # [N, P] of the values
     form: int,  # PLAIN, LOGARITHM or LOGIT
     rate: float,  # of the first `leading` columns
@@ -64,25 +113,42 @@ def update_rows(
     second_out: wp.array2d[float],  # [N, P] mean of its square, changed
     values_out: wp.array2d[float],  # [N, P] what is rendered; the same memory as the parameters if PLAIN
 ):
-    """One step of Adam (Kingma and Ba 2015) on the parameters behind the values."""
+    """One step of Adam (Kingma and Ba 2015) on the parameters behind the values, and those it has waited for."""
     i = base + wp.tid()
     if taken[i] == wp.uint8(0):
         return
     count = float(steps[i])
     by_first = 1.0 / (1.0 - wp.pow(BETA_1, count))
     by_second = 1.0 / (1.0 - wp.pow(BETA_2, count))
+    behind = float(waited[i])
+    decay_1 = wp.pow(BETA_1, behind)
+    decay_2 = wp.pow(BETA_2, behind)
+    half_way = wp.pow(BETA_2, 0.5 * behind)
+    by_half_way = 1.0 / (1.0 - wp.pow(BETA_2, count - 1.0 - 0.5 * behind))
     for j in range(gradient.shape[1]):
-        g = gradient[i, j] + pull
+        slope = float(1.0)
         if form == LOGARITHM:
-            g *= values_out[i, j]
+            slope = values_out[i, j]
         elif form == LOGIT:
-            g *= values_out[i, j] * (1.0 - values_out[i, j])
-        first = first_out[i, j] + (1.0 - BETA_1) * (g - first_out[i, j])
-        second = second_out[i, j] + (1.0 - BETA_2) * (g * g - second_out[i, j])
+            slope = values_out[i, j] * (1.0 - values_out[i, j])
+        step = wp.where(j < leading, rate, rate_of_rest)
+        parameter = parameters_out[i, j]
+        first = first_out[i, j]
+        second = second_out[i, j]
+        if behind > 0.0:
+            parameter -= step * first * moves[i][0] / (wp.sqrt(second) + EPSILON)
+            constant = pull * slope  # all the gradient there was
+            if constant != 0.0:
+                size = (second * half_way + constant * constant * (1.0 - half_way)) * by_half_way
+                parameter -= step * moves[i][1] * constant / (wp.sqrt(size) + EPSILON)
+            first = first * decay_1 + constant * (1.0 - decay_1)
+            second = second * decay_2 + constant * constant * (1.0 - decay_2)
+        g = (gradient[i, j] + pull) * slope
+        first += (1.0 - BETA_1) * (g - first)
+        second += (1.0 - BETA_2) * (g * g - second)
         first_out[i, j] = first
         second_out[i, j] = second
-        step = wp.where(j < leading, rate, rate_of_rest)
-        parameter = parameters_out[i, j] - step * first * by_first / (wp.sqrt(second * by_second) + EPSILON)
+        parameter -= step * first * by_first / (wp.sqrt(second * by_second) + EPSILON)
         parameters_out[i, j] = parameter
         if form == LOGARITHM:
             values_out[i, j] = wp.exp(parameter)
@@ -94,7 +160,7 @@ def update_rows(
 def note_gradients(
     # In:
     base: int,  # first Gaussian of this launch
-    taken: wp.array[wp.uint8],  # [N] 1 = was seen
+    taken: wp.array[wp.uint8],  # [N] of `count_steps`
     means2d: wp.array[wp.vec2],  # [N] gradient of the projected centres [1 / pixels]
     half_size: wp.vec2,  # of the image [pixels]
     # Out:
@@ -103,7 +169,7 @@ def note_gradients(
 ):
     """What densification looks at: how much the loss wants a projected centre to move, on average over views."""
     i = base + wp.tid()
-    if taken[i] == wp.uint8(0):
+    if int(taken[i]) != SEEN:
         return
     sums_out[i] = sums_out[i] + wp.length(wp.cw_mul(means2d[i], half_size))
     views_out[i] = views_out[i] + 1

@@ -255,7 +255,7 @@ class _Run:
         taken = model.update(gradients, settings.means_rate_at(self.step, self.extent), settings)
         if self.exposure is not None and colour_map is not None and colour_map.grad is not None:
             self.exposure.update(index, colour_map.grad, share)
-        self.log.leave_out("updates_of_unseen_gaussians", len(model) - int(taken.sum()))
+        self.log.leave_out("updates_of_unseen_gaussians", len(model) - taken.count)
         value = float(loss.detach())
         self.loss = value if math.isnan(self.loss) else MEMORY * self.loss + (1 - MEMORY) * value
         self.step += 1

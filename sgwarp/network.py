@@ -103,7 +103,7 @@ def load_network(
 
     Args:
         path: .safetensors, or a file of torch.save.
-        inputs, voxel, space: For a checkpoint, which does not say: by default the inputs that have its number of
+        inputs, voxel, space: For a checkpoint, which does not say: by default the only inputs that have its number of
             channels, 0.02 m, and the file's name. They must not contradict a file that does say.
 
     Raises:
@@ -113,8 +113,13 @@ def load_network(
     metadata = _metadata(path)
     net = net_for(state, path)
     if metadata is None:
-        by_channels = {channels: mode for mode, channels in INPUT_CHANNELS.items()}
-        chosen = inputs or by_channels.get(net.in_channels, "raw56")
+        fitting = [mode for mode, channels in INPUT_CHANNELS.items() if channels == net.in_channels]
+        if inputs is None and len(fitting) > 1:
+            raise InputError(
+                f"{path}: takes {net.in_channels} channels, which may be {', '.join(fitting)}, and does not say which; "
+                "name its inputs (OpenScene's networks take ones, or signed-rgb if trained with input_color)"
+            )
+        chosen = inputs or (fitting[0] if fitting else "raw56")
         return SemanticNetwork(net, chosen, 0.02 if voxel is None else voxel, space or Path(path).stem)  # type: ignore[arg-type]
     try:
         stored: dict[str, Any] = {name: metadata[name] for name in ("inputs", "space")}

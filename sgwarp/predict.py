@@ -67,15 +67,18 @@ class Prediction:
     def render(self, gaussians: Gaussians, camera: Camera, settings: RasterSettings | None = None) -> Tensor:
         """The embedding as seen from a camera, float32 [H, W, C]: H channels are splatted, then mapped pixel by pixel.
 
-        Both steps are linear, so this is the splatted embedding itself, up to rounding. Not normalised.
+        Both steps are linear, so this is the splatted embedding itself, up to rounding. Not normalised. Labels are
+        few, and their shares are not linear in the hidden features: they are splatted themselves.
 
         Raises:
             InputError: The prediction belongs to another scene.
         """
         if self.fingerprint != gaussians.fingerprint:
             raise InputError("the prediction belongs to another scene; predict this one")
-        blended = rasterize(gaussians, camera, self.hidden_of_gaussians, settings=settings or RasterSettings())
-        return blended.features @ self.matrix
+        settings = settings or RasterSettings()
+        if self.labels is not None:
+            return rasterize(gaussians, camera, self.semantics().features, settings=settings).features
+        return rasterize(gaussians, camera, self.hidden_of_gaussians, settings=settings).features @ self.matrix
 
 
 def predict(gaussians: Gaussians, network: SemanticNetwork, *, log: RunLog | None = None) -> Prediction:
@@ -97,6 +100,9 @@ def predict(gaussians: Gaussians, network: SemanticNetwork, *, log: RunLog | Non
     log.leave_out("gaussians_that_share_a_voxel", int((rows >= 0).sum()) - len(voxels.features))
     network.net.eval()
     with log.stage("network"), torch.no_grad():
-        hidden = network.net.hidden(voxels).features
-    matrix = network.net.final.kernel.detach()
-    return Prediction(hidden.float(), rows, matrix, network.space, gaussians.fingerprint, network.labels)
+        voxels = voxels.with_features(voxels.features.to(network.net.final.kernel.dtype))
+        hidden = network.net.hidden(voxels).features.float()
+    if not bool(torch.isfinite(hidden).all()):
+        raise InputError("the network's output is not finite: its weights are damaged, or were trained to infinity")
+    matrix = network.net.final.kernel.detach().float()
+    return Prediction(hidden, rows, matrix, network.space, gaussians.fingerprint, network.labels)

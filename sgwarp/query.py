@@ -141,8 +141,12 @@ def class_votes(
         both.append(predicted)
     seen = seen_by(semantics, predicted, ensemble)
     if semantics.labels is not None:
-        shares = _together([_label_shares(one, classes) for one in both], both, ensemble)
-        return shares / shares.sum(dim=1, keepdim=True).clamp(min=1.0) if predicted is not None else shares
+        if predicted is None:
+            return _label_shares(semantics, classes)
+        # A sum of shares is twice their mean; the largest of both may add up to more than all there is.
+        how: Ensemble = "mean" if ensemble == "sum" else ensemble
+        total = _together([_label_shares(one, None) for one in both], both, how).sum(dim=1, keepdim=True)
+        return _together([_label_shares(one, classes) for one in both], both, how) / total.clamp(min=1.0)
     if not classes:
         raise InputError(f"classes: semantics in space '{semantics.space}' need the names of the classes to look for")
     if encoder is None:
@@ -154,7 +158,8 @@ def class_votes(
         each = [evidence(scores, one) for scores, one in zip(each, both, strict=True)]
     scores = _together(each, both, ensemble)
     if scoring == "evidence":
-        scores = torch.cat([scores, torch.full_like(scores[:, :1], NONE_LEVEL)], dim=1)
+        level = NONE_LEVEL * (2 if len(both) == 2 and ensemble == "sum" else 1)
+        scores = torch.cat([scores, torch.full_like(scores[:, :1], level)], dim=1)
     votes = confidence(scores, TEMPERATURES[scoring] if temperature is None else temperature)[:, : len(classes)]
     return torch.where(seen.to(votes.device)[:, None], votes, 0.0)
 

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Literal
 
 import tyro
 
-from sgwarp.commands.options import Options, check_name
+from sgwarp.commands.options import Options, check_name, require_no_lift
 from sgwarp.errors import InputError
 from sgwarp.progress import show_progress
 
@@ -25,7 +25,7 @@ class Distill(Options):
     """Train a network that predicts semantics from raw Gaussians, on scenes that semantics were lifted for.
 
     Under torchrun several processes share the scenes of a step. A run that was interrupted goes on from its state file,
-    {out}.state.pt, if it is started again with the same options.
+    {out}.state.pt, if it is started again with the same options and scenes.
     """
 
     scenes: tyro.conf.Positional[list[Path]]
@@ -43,8 +43,9 @@ class Distill(Options):
     arch: Literal["14A", "18A", "34A", "34C"] = "34A"
     """Architecture of the MinkUNet."""
 
-    inputs: Literal["full", "xyz-rgb", "raw56"] = "full"
-    """full: opacity, colour and covariance; xyz-rgb: colour alone; raw56: the 56 numbers of a PLY file."""
+    inputs: Literal["full", "xyz-rgb", "raw56", "ones", "signed-rgb"] = "full"
+    """full: opacity, colour and covariance; xyz-rgb: colour alone; raw56: the 56 numbers of a PLY file; ones,
+    signed-rgb: as OpenScene without and with colours."""
 
     voxel: float = 0.02
     """Side of a voxel [m]."""
@@ -78,6 +79,7 @@ class Distill(Options):
 
     def run(self) -> None:
         check_name("--out", self.out, ".safetensors")
+        require_no_lift(self.out)
         from sgwarp.distill.processes import joined
 
         log = self.start()
@@ -86,18 +88,16 @@ class Distill(Options):
             from sgwarp.distill.data import scenes_in
             from sgwarp.distill.train import distill, state_path
             from sgwarp.network import save_network
-            from sgwarp.nn.checkpoint import read_weights
 
             scenes, validation = scenes_in(self.scenes), scenes_in(self.validation or [])
             settings = self._settings()
-            weights = None if self.checkpoint is None else read_weights(self.checkpoint)
             with show_progress("distill") as progress:
                 network, history = distill(
                     scenes,
                     settings,
                     validation=validation,
                     class_vectors=self._class_vectors(scenes, log),
-                    weights=weights,
+                    weights=self.checkpoint,
                     state=state_path(self.out),
                     processes=processes,
                     device=self.device,
@@ -110,6 +110,7 @@ class Distill(Options):
                 notes = {"scenes": len(scenes), "epochs": settings.epochs, "loss": history[-1].loss}
                 save_network(network, self.out, notes)
                 curves = write_curves(history, self.out.with_suffix(""))
+            state_path(self.out).unlink(missing_ok=True)  # done: started again, a run begins anew
             log.outputs += [str(self.out), *map(str, curves)]
             log.write(self.out.parent)
             print(log.summary())

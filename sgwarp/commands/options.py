@@ -189,6 +189,24 @@ def check_name(option: str, path: Path, suffix: str) -> None:
     check_folder(option, path.parent)
 
 
+def require_no_lift(out: Path) -> None:
+    """Refuse to write over semantics that were lifted from views: to make them again may take hours.
+
+    Raises:
+        InputError: `out` is such a file.
+    """
+    from sgwarp.io.store import read_notes
+
+    if not out.is_file():
+        return
+    try:
+        lifted = "network" not in read_notes(out)
+    except InputError:  # no semantics at all
+        return
+    if lifted:
+        raise InputError(f"--out {out}: holds semantics that were lifted from views; choose another name or remove it")
+
+
 def check_folder(option: str, folder: Path) -> None:
     """Refuse an output folder that cannot be written to.
 

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Literal
 
-from sgwarp.commands.options import SceneOptions, check_name, load_on
+from sgwarp.commands.options import SceneOptions, check_name, load_on, require_no_lift
 
 if TYPE_CHECKING:
     from sgwarp.runlog import RunLog
@@ -30,8 +30,9 @@ class Predict(SceneOptions):
     always: bool = False
     """Run the network even if the projection covers the scene."""
 
-    inputs: Literal["full", "xyz-rgb", "raw56"] | None = None
-    """Of a checkpoint, which does not say; by default those that have its number of channels."""
+    inputs: Literal["full", "xyz-rgb", "raw56", "ones", "signed-rgb"] | None = None
+    """Of a checkpoint, which does not say: raw56 for the paper's; for OpenScene's ones, or signed-rgb if trained with
+    input_color; by default the only ones that have its number of channels."""
 
     voxel: float | None = None
     """Side of a voxel [m], of a checkpoint, which does not say; by default 0.02."""
@@ -41,6 +42,7 @@ class Predict(SceneOptions):
 
     def run(self) -> None:
         check_name("--out", self.out, ".safetensors")
+        require_no_lift(self.out)
         with self.logged(self.out.parent) as log:
             from sgwarp.io.store import save_semantics
 

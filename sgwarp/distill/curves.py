@@ -15,7 +15,8 @@ def write_curves(history: Sequence[Epoch], stem: Path) -> list[Path]:
     """{stem}_curves.json, and with matplotlib {stem}_curves.png: loss, validation cosine and mIoU by epoch."""
     written = [stem.with_name(f"{stem.name}_curves.json")]
     with atomic_path(written[0]) as temporary:
-        temporary.write_text(json.dumps([asdict(epoch) for epoch in history], indent=1) + "\n", encoding="utf-8")
+        figures = [asdict(epoch) for epoch in history]
+        temporary.write_text(json.dumps(figures, indent=1, allow_nan=False) + "\n", encoding="utf-8")
     try:
         from matplotlib.figure import Figure
     except ImportError:

@@ -24,6 +24,8 @@ class TrainingScene:
 
     name: str
     load: Callable[[], tuple[Gaussians, Semantics]]
+    stamp: str = ""  # changes when the files do: a run is not resumed on other data
+    files: tuple[Path, ...] = ()
 
 
 def scenes_in(paths: Sequence[Path]) -> list[TrainingScene]:
@@ -45,7 +47,7 @@ def scenes_in(paths: Sequence[Path]) -> list[TrainingScene]:
 
 
 def _scene(path: Path) -> TrainingScene:
-    semantics = path.with_name(path.name.split(".")[0] + ".safetensors")
+    semantics = path.with_name(path.name.removesuffix(".ply").removesuffix(".compressed") + ".safetensors")
     if not path.is_file():
         raise InputError(f"{path}: no such file; check the path")
     if not semantics.is_file():
@@ -58,7 +60,9 @@ def _scene(path: Path) -> TrainingScene:
         gaussians = load_gaussians(path)
         return gaussians, load_semantics(semantics, gaussians)
 
-    return TrainingScene(str(path), load)
+    files = (path, semantics)
+    stamp = " ".join(f"{file.stat().st_size}:{file.stat().st_mtime_ns}" for file in files)
+    return TrainingScene(str(path), load, stamp, files)
 
 
 @dataclass(frozen=True, eq=False)
@@ -118,8 +122,10 @@ def make_example(
     sums = voxels.features.new_zeros(count, semantics.features.shape[1])
     for start in range(0, len(known), CHUNK):
         part = known[start : start + CHUNK]
-        features = semantics.features[part].to(sums)
-        unit = torch.nn.functional.normalize(features, dim=1, eps=1e-20)
+        features = semantics.features[part.to(semantics.features.device)].to(sums)
+        unusable = ~torch.isfinite(features).all(dim=1)
+        trust[part[unusable]] = 0.0
+        unit = torch.nn.functional.normalize(torch.where(unusable[:, None], 0.0, features), dim=1, eps=1e-20)
         sums.index_add_(0, here[start : start + CHUNK], unit * trust[part][:, None])
     weights = sums.new_zeros(count).index_add_(0, here, trust[known])
     filled = (sums.square().sum(dim=1) > 0).nonzero()[:, 0]

@@ -47,6 +47,11 @@ class DistillSettings:
             value = getattr(self, name)
             if not 0 < value < math.inf:
                 raise InputError(f"{name}: expected a number above 0, got {value}")
+        for name in ("epochs", "scenes_per_step", "validate_every"):
+            if getattr(self, name) != int(getattr(self, name)):
+                raise InputError(f"{name}: expected a whole number, got {getattr(self, name)}")
+        if not 0 <= self.weight_decay < math.inf:
+            raise InputError(f"weight_decay: expected a number that is not negative, got {self.weight_decay}")
 
     def rate(self, epoch: int) -> float:
         """Learning rate of an epoch, counted from 0."""

@@ -6,6 +6,8 @@ had not been, and several processes see the same scenes as one.
 
 from __future__ import annotations
 
+import hashlib
+import math
 import os
 import pickle
 import time
@@ -17,7 +19,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from sgwarp.distill.data import Example, TrainingScene, make_example
+from sgwarp.distill.data import CHUNK, Example, TrainingScene, make_example
 from sgwarp.distill.processes import Processes
 from sgwarp.distill.settings import DistillSettings, Epoch
 from sgwarp.errors import InputError
@@ -25,7 +27,7 @@ from sgwarp.evaluate.segmentation import ConfusionMatrix
 from sgwarp.io.atomic import atomic_path
 from sgwarp.io.files import reading
 from sgwarp.network import SemanticNetwork
-from sgwarp.nn.checkpoint import load_into
+from sgwarp.nn.checkpoint import load_into, read_weights
 from sgwarp.nn.inputs import INPUT_CHANNELS
 from sgwarp.nn.mink_unet import MinkUNet
 from sgwarp.predict import predict
@@ -40,7 +42,7 @@ def distill(
     *,
     validation: Sequence[TrainingScene] = (),
     class_vectors: Tensor | None = None,
-    weights: dict[str, Tensor] | None = None,
+    weights: dict[str, Tensor] | str | os.PathLike[str] | None = None,
     state: Path | None = None,
     processes: Processes | None = None,
     device: str | torch.device = "cpu",
@@ -54,7 +56,7 @@ def distill(
         settings: See DistillSettings.
         validation: Scenes to measure on and not to learn from.
         class_vectors: Vectors of classes for the validation's mIoU, [Q, C]; for labels each label is a class.
-        weights: State dict to start from instead of random weights.
+        weights: State dict, or the file of one, to start from instead of random weights.
         state: File for what is needed to go on after an interruption, written after every epoch; if it is there
             already, the run goes on from it.
         processes: Those of torchrun; `settings.scenes_per_step` must be a multiple of their number.
@@ -81,8 +83,9 @@ def distill(
     with log.stage("read"):
         kind = _kind(scenes[0].load()[1], scenes[0].name)
     run = _Run(settings, kind, class_vectors, processes, torch.device(device), log)
+    run.data = _identity(scenes, validation)
     if weights is not None:
-        load_into(run.network.net, weights)
+        run.start_from(weights)
     if state is not None and state.exists():
         run.restore(state)
     report = progress or (lambda done, total, figures: None)
@@ -95,6 +98,12 @@ def distill(
         if getattr(last, name) is not None:
             log.error[name] = getattr(last, name)
     return run.network, run.history
+
+
+def _identity(*groups: Sequence[TrainingScene]) -> str:
+    """Names and stamps of the scenes, as one number."""
+    text = repr([[(scene.name, scene.stamp) for scene in scenes] for scenes in groups])
+    return hashlib.sha256(text.encode()).hexdigest()[:16]
 
 
 Kind = tuple[str, int, tuple[str, ...] | None]  # space, channels and labels of the semantics
@@ -122,6 +131,8 @@ class _Run:
     network: SemanticNetwork = field(init=False)
     optimizer: torch.optim.AdamW = field(init=False)
     history: list[Epoch] = field(default_factory=list)
+    data: str = ""  # which scenes
+    first_weights: str = ""  # which weights the run started from, if not from random ones
 
     def __post_init__(self) -> None:
         s, (space, channels, labels) = self.settings, self.kind
@@ -132,6 +143,19 @@ class _Run:
         for parameter in net.parameters():  # processes add up the gradients of all, also of a process without a target
             parameter.grad = torch.zeros_like(parameter)
         self.optimizer = torch.optim.AdamW(net.parameters(), lr=s.learning_rate, weight_decay=s.weight_decay)
+
+    def start_from(self, weights: dict[str, Tensor] | str | os.PathLike[str]) -> None:
+        """Take these weights instead of random ones."""
+        if isinstance(weights, dict):
+            state = weights
+            load_into(self.network.net, state, "weights")
+        else:
+            state = read_weights(weights)
+            load_into(self.network.net, state, weights)
+        digest = hashlib.sha256()
+        for name in sorted(state):
+            digest.update(state[name].detach().cpu().float().numpy().tobytes())
+        self.first_weights = digest.hexdigest()[:16]
 
     def epoch(
         self, epoch: int, scenes: Sequence[TrainingScene], validation: Sequence[TrainingScene], report: Report
@@ -150,11 +174,18 @@ class _Run:
             done = epoch * len(scenes) + min(first + s.scenes_per_step, len(scenes))
             figure = f"loss {total / measured:.4f}" if measured else "no target yet"
             report(done, s.epochs * len(scenes), f"epoch {epoch + 1}, {figure}")
+        if not measured:
+            raise InputError(
+                f"{scenes[0].name}: no Gaussian of this scene, or of any other, has a voxel of {s.voxel} m and lifted "
+                "features; take larger voxels, or lift from views that see the scenes"
+            )
+        if measured < len(scenes):
+            self.log.left_out["scenes_without_target"] = len(scenes) - int(measured)
         figures: dict[str, float | None] = {}
         if validation and ((epoch + 1) % s.validate_every == 0 or epoch + 1 == s.epochs):
             with self.log.stage("validate"):
                 figures = self.validate(validation)
-        mean = total / measured if measured else None
+        mean = total / measured
         seconds = time.perf_counter() - start
         self.history.append(Epoch(epoch + 1, s.rate(epoch), mean, seconds, **figures))
 
@@ -184,6 +215,12 @@ class _Run:
             figures += torch.tensor([float(loss.detach()), 1.0], dtype=torch.float64, device=self.device)
         self.processes.add_up([figures])
         count = float(figures[1])
+        if not math.isfinite(float(figures[0])):
+            names = ", ".join(scenes[index].name for index in chosen)
+            raise InputError(
+                f"{names}: the loss is not finite in epoch {epoch + 1}; lower the learning rate, or look for Gaussians "
+                "with extreme values. The state file, if there is one, holds the epoch before"
+            )
         if count:
             with self.log.stage("train"):
                 self.processes.add_up([*gradients, *sums])
@@ -223,14 +260,17 @@ class _Run:
             gaussians, semantics = scene.load()
             _kind(semantics, scene.name, self.kind)
             prediction = predict(gaussians, self.network)
-            known = (semantics.seen & prediction.known.cpu()).nonzero()[:, 0]
-            embedded = prediction.hidden @ prediction.matrix
-            ours = embedded[prediction.rows[known.to(embedded.device)]].cpu()
-            theirs = semantics.features[known].to(torch.float32)
-            cosine = torch.nn.functional.cosine_similarity(ours, theirs, dim=1)
-            sums += torch.tensor([float(cosine.double().sum()), len(known)], dtype=torch.float64)
-            if confusion is not None and vectors is not None:
-                confusion.add((ours @ vectors.T).argmax(dim=1), (theirs @ vectors.T).argmax(dim=1))
+            known = (semantics.seen.cpu() & prediction.known.cpu()).nonzero()[:, 0]
+            for part in known.split(CHUNK):
+                rows = prediction.rows[part.to(prediction.rows.device)]
+                ours = (prediction.hidden[rows] @ prediction.matrix).cpu()
+                theirs = semantics.features[part.to(semantics.features.device)].cpu().to(torch.float32)
+                finite = torch.isfinite(theirs).all(dim=1)
+                ours, theirs = ours[finite], theirs[finite]
+                cosine = torch.nn.functional.cosine_similarity(ours, theirs, dim=1)
+                sums += torch.tensor([float(cosine.double().sum()), len(ours)], dtype=torch.float64)
+                if confusion is not None and vectors is not None:
+                    confusion.add((ours @ vectors.T).argmax(dim=1), (theirs @ vectors.T).argmax(dim=1))
         sums = sums.to(self.device)
         self.processes.add_up([sums])
         figures: dict[str, float | None] = {"cosine": float(sums[0] / sums[1]) if sums[1] else None}
@@ -261,7 +301,7 @@ class _Run:
         """
         try:
             with reading(path):
-                content = torch.load(path, map_location=self.device, weights_only=True)
+                content = torch.load(path, map_location="cpu", weights_only=True)
             stored: dict[str, Any] = content["settings"]
             mine = self._signature()
             changed = [name for name in mine if mine[name] != stored.get(name)]
@@ -273,7 +313,9 @@ class _Run:
             self.network.net.load_state_dict(content["net"])
             self.optimizer.load_state_dict(content["optimizer"])
             self.history = [Epoch(**epoch) for epoch in content["history"]]
-        except (KeyError, TypeError, RuntimeError, EOFError, pickle.UnpicklingError) as error:
+        except InputError:
+            raise
+        except (KeyError, TypeError, ValueError, RuntimeError, EOFError, pickle.UnpicklingError) as error:
             raise InputError(f"{path}: is no training state, or damaged ({type(error).__name__}); remove it") from None
         self.log.leave_out("epochs_done_before", len(self.history))
 
@@ -282,7 +324,7 @@ class _Run:
         space, channels, labels = self.kind
         plain = asdict(self.settings) | {"space": space, "channels": channels, "labels": list(labels or ())}
         augment = plain.pop("augment")
-        return plain | {"augment": repr(augment)}
+        return plain | {"augment": repr(augment), "scenes": self.data, "first weights": self.first_weights}
 
 
 def _generator(*numbers: int) -> torch.Generator:

@@ -10,7 +10,7 @@ from torch import Tensor
 from sgwarp.fitting.model import Gradients, Model
 from sgwarp.fitting.seeds import generator
 from sgwarp.fitting.settings import FitSettings
-from sgwarp.ops.adam import note_gradients
+from sgwarp.ops.adam import Taken, note_gradients
 from sgwarp.ops.reference import rotation_matrices
 from sgwarp.scene import Camera
 
@@ -37,7 +37,7 @@ class Densify:
         self.sums = torch.zeros(count, device=device)
         self.views = torch.zeros(count, dtype=torch.int32, device=device)
 
-    def after_step(self, model: Model, step: int, gradients: Gradients, taken: Tensor, camera: Camera) -> None:
+    def after_step(self, model: Model, step: int, gradients: Gradients, taken: Taken, camera: Camera) -> None:
         """Note what a step has shown, and at its intervals refine; `step` counts from 1."""
         settings = self.settings
         if step >= settings.scaled(REFINE_UNTIL):

@@ -8,7 +8,7 @@ from collections.abc import Mapping
 import torch
 from torch import Tensor
 
-from sgwarp.ops.adam import Group, update
+from sgwarp.ops.adam import Group, Taken, update
 
 RATE, LAST_RATE = 0.01, 0.001  # of the reference implementation
 
@@ -36,13 +36,15 @@ class Exposure:
 
     def update(self, index: int, gradient: Tensor, share: float) -> None:
         """One step for one photograph; `share` of all steps are done."""
-        taken = torch.zeros(len(self.steps), dtype=torch.uint8, device=self.steps.device)
-        taken[index] = 1
+        marks = torch.zeros(len(self.steps), dtype=torch.uint8, device=self.steps.device)
+        marks[index] = 1
         self.steps[index] += 1
+        none = torch.zeros_like(self.steps)
+        taken = Taken(marks, self.steps, none, none.float()[:, None].expand(-1, 2).contiguous())
         gradients = torch.zeros_like(self.group.parameters)
         gradients[index] = gradient
         rate = math.exp((1 - share) * math.log(RATE) + share * math.log(LAST_RATE))
-        update(self.group, gradients, taken, self.steps, rate)
+        update(self.group, gradients, taken, rate)
 
     def state(self) -> dict[str, Tensor]:
         return {"maps": self.group.parameters, "first": self.group.first, "second": self.group.second} | {

@@ -10,11 +10,12 @@ from torch import Tensor
 from sgwarp.fitting.model import Gradients, Model
 from sgwarp.fitting.seeds import generator, number
 from sgwarp.fitting.settings import FitSettings
-from sgwarp.ops.adam import add_noise
+from sgwarp.ops.adam import Taken, add_noise
 from sgwarp.scene import Camera
 
 REFINE_UNTIL = 25_000  # of the reference's steps
-GROWTH = 1.05  # of the count, at each refinement
+GROWTH = 1.05  # of the count at each refinement, and more where that would not reach the cap
+FULL_AT = 15_000  # of the reference's steps, by which the cap is reached
 MOST_COPIES = 51  # that the change of opacity and scale accounts for
 LEAST_LEFT = 1e-6  # opacities end this far below 1
 
@@ -28,7 +29,7 @@ class MarkovChain:
         self.settings = settings
         self.extent = extent
 
-    def after_step(self, model: Model, step: int, gradients: Gradients, taken: Tensor, camera: Camera) -> None:
+    def after_step(self, model: Model, step: int, gradients: Gradients, taken: Taken, camera: Camera) -> None:
         """Refine at its intervals, and add noise; `step` counts from 1."""
         settings = self.settings
         if settings.refines_at(step, REFINE_UNTIL):
@@ -49,7 +50,10 @@ class MarkovChain:
             model.assign(hosts, changed)
 
     def _grow(self, model: Model, step: int) -> None:
-        wanted = min(self.settings.cap, int(GROWTH * len(model))) - len(model)
+        settings = self.settings
+        rounds = max(1, (settings.scaled(FULL_AT) - step) // settings.refine_every)
+        growth = max(GROWTH, (settings.cap / len(model)) ** (1 / rounds))
+        wanted = min(settings.cap, int(growth * len(model))) - len(model)
         if wanted > 0:
             everyone = torch.arange(len(model), device=model.steps.device)
             hosts = self._choose(model, everyone, wanted, generator(self.settings.seed, step, "grow"))

@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 
 from sgwarp.fitting.settings import FitSettings
-from sgwarp.ops.adam import Group, count_steps, update, values_of
+from sgwarp.ops.adam import Group, Taken, count_steps, update, values_of
 from sgwarp.scene import SH_COUNTS, Gaussians
 
 LEAST_SCALE, LEAST_FAINTNESS = 1e-9, 1e-6  # so that logarithms and logits are finite
@@ -34,12 +34,14 @@ class Model:
 
     Attributes:
         groups: Parameters by the name of the field of `Gaussians` that they stand for.
-        steps: How many steps each Gaussian has taken, int32 [N].
+        steps: Of each Gaussian since it came, int32 [N].
+        skipped: How many of the last ones it was not seen in, and has yet to make up for, int32 [N].
     """
 
-    def __init__(self, groups: dict[str, Group], steps: Tensor) -> None:
+    def __init__(self, groups: dict[str, Group], steps: Tensor, skipped: Tensor) -> None:
         self.groups = groups
         self.steps = steps
+        self.skipped = skipped
 
     @classmethod
     def starting(cls, gaussians: Gaussians) -> Model:
@@ -53,7 +55,8 @@ class Model:
             "sh": gaussians.sh.clone(),
         }
         groups = {name: Group.starting(value, FORMS[name]) for name, value in parameters.items()}
-        return cls(groups, torch.zeros(len(gaussians), dtype=torch.int32, device=gaussians.device))
+        none = torch.zeros(len(gaussians), dtype=torch.int32, device=gaussians.device)
+        return cls(groups, none, none.clone())
 
     def __len__(self) -> int:
         return len(self.steps)
@@ -68,9 +71,9 @@ class Model:
         fields["quats"] = torch.nn.functional.normalize(fields["quats"])
         return Gaussians(**fields)
 
-    def update(self, gradients: Gradients, means_rate: float, settings: FitSettings) -> Tensor:
-        """One step of the optimiser; returns 1 for each Gaussian that has taken it, uint8 [N]."""
-        taken = count_steps(gradients.opacities, gradients.sh, self.steps, sparse=settings.sparse)
+    def update(self, gradients: Gradients, means_rate: float, settings: FitSettings) -> Taken:
+        """One step of the optimiser; returns who has taken it."""
+        taken = count_steps(gradients.opacities, gradients.sh, self.steps, self.skipped, sparse=settings.sparse)
         mcmc = settings.strategy == "mcmc"
         pulls = {
             "scales": settings.scale_pull / (3 * len(self)) if mcmc else 0.0,
@@ -83,10 +86,10 @@ class Model:
             "opacities": settings.opacities_rate,
         }
         for name, rate in rates.items():
-            update(self.groups[name], getattr(gradients, name), taken, self.steps, rate, pull=pulls.get(name, 0.0))
+            update(self.groups[name], getattr(gradients, name), taken, rate, pull=pulls.get(name, 0.0))
         rest = settings.colors_rate * REST_SHARE
         sh = self.groups["sh"]
-        update(sh, gradients.sh, taken, self.steps, settings.colors_rate, leading=3, rate_of_rest=rest)
+        update(sh, gradients.sh, taken, settings.colors_rate, leading=3, rate_of_rest=rest)
         return taken
 
     def raise_degree(self, degree: int) -> None:
@@ -105,7 +108,7 @@ class Model:
                 t[rows] for t in (group.parameters, group.first, group.second)
             )
             group.values = group.parameters if group.form == "plain" else group.values[rows]
-        self.steps = self.steps[rows]
+        self.steps, self.skipped = self.steps[rows], self.skipped[rows]
 
     def append(self, rows: Tensor, changed: Mapping[str, Tensor] = {}) -> None:
         """Copies of these rows, with other parameters where given; they have taken no step."""
@@ -116,7 +119,8 @@ class Model:
             group.parameters = torch.cat([group.parameters, new])
             group.first, group.second = (torch.cat([t, none]) for t in (group.first, group.second))
             group.values = group.parameters if values is None else values
-        self.steps = torch.cat([self.steps, torch.zeros_like(self.steps[:1]).expand(len(rows))])
+        none = torch.zeros(len(rows), dtype=torch.int32, device=self.steps.device)
+        self.steps, self.skipped = torch.cat([self.steps, none]), torch.cat([self.skipped, none])
 
     def assign(self, rows: Tensor, changed: Mapping[str, Tensor]) -> None:
         """Other parameters for these rows, which have then taken no step."""
@@ -128,10 +132,11 @@ class Model:
             group.first[rows] = 0.0
             group.second[rows] = 0.0
         self.steps[rows] = 0
+        self.skipped[rows] = 0
 
     def state(self) -> dict[str, Tensor]:
         """Everything as tensors by name."""
-        named = {"steps": self.steps}
+        named = {"steps": self.steps, "skipped": self.skipped}
         for name, group in self.groups.items():
             named |= {f"{name}.{part}": getattr(group, part) for part in ("parameters", "first", "second", "values")}
         return named
@@ -145,4 +150,4 @@ class Model:
                 state[f"{name}.{part}"] for part in ("parameters", "first", "second", "values")
             )
             groups[name] = Group(parameters, parameters if form == "plain" else values, first, second, form)
-        return cls(groups, state["steps"])
+        return cls(groups, state["steps"], state["skipped"])

@@ -2,10 +2,15 @@
 
 from __future__ import annotations
 
+import argparse
+import collections
 import os
 import pickle
+import re
 from pathlib import Path
+from typing import Any
 
+import numpy as np
 import torch
 from torch import Tensor
 
@@ -14,6 +19,7 @@ from sgwarp.io.files import reading
 from sgwarp.nn.mink_unet import ARCHITECTURES, MinkUNet
 
 PREFIXES = ("module.", "net3d.")  # of DistributedDataParallel and of OpenScene
+COLOURS = re.compile(r"\x1b\[[0-9;]*m")  # torch prints some of its messages in bold
 SHOWN = 3  # names of each kind in a message
 
 
@@ -33,10 +39,10 @@ def read_weights(path: str | os.PathLike[str]) -> dict[str, Tensor]:
         except SafetensorError as error:
             raise InputError(f"{path}: is not a safetensors file, or is cut short ({error})") from None
     try:
-        with reading(path):
+        with reading(path), torch.serialization.safe_globals(_bystanders()):
             content = torch.load(path, map_location="cpu", weights_only=True)
     except (pickle.UnpicklingError, RuntimeError, EOFError, ValueError, LookupError, AttributeError) as error:
-        reason = next(iter(str(error).splitlines()), type(error).__name__)
+        reason = COLOURS.sub("", next(iter(str(error).splitlines()), type(error).__name__))
         raise InputError(f"{path}: is no file of plain tensors ({reason}); save its state_dict alone") from None
     for name in ("state_dict", "model_state_dict", "model"):
         if isinstance(content, dict) and isinstance(content.get(name), dict):
@@ -45,6 +51,19 @@ def read_weights(path: str | os.PathLike[str]) -> dict[str, Tensor]:
     if not tensors or not content:
         raise InputError(f"{path}: holds no tensors by name; save the network's state_dict")
     return without_prefixes(content)
+
+
+def _bystanders() -> list[Any]:
+    """Harmless types that training scripts store beside the weights: figures, counters, arguments."""
+    kinds = (np.float64, np.float32, np.int64, np.int32, np.bool_)
+    core = np._core.multiarray  # type: ignore[attr-defined]
+    functions = [
+        (f, f"{module}.multiarray.{f.__name__}")
+        for f in (core.scalar, core._reconstruct)
+        for module in ("numpy._core", "numpy.core")
+    ]
+    dtypes = [type(np.dtype(kind)) for kind in kinds]
+    return [*functions, *dtypes, np.dtype, np.ndarray, argparse.Namespace, collections.defaultdict]
 
 
 def without_prefixes(state: dict[str, Tensor]) -> dict[str, Tensor]:

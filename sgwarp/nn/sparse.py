@@ -86,8 +86,9 @@ def pool(keys: Tensor, features: Tensor) -> tuple[SparseTensor, Tensor]:
     if len(keys) and int(keys.min()) < 0:
         raise InputError("keys: a point without voxel (not finite, or out of range) is among them; leave it out first")
     unique, rows, counts = torch.unique(keys, return_inverse=True, return_counts=True)
-    sums = features.new_zeros(len(unique), features.shape[1]).index_add(0, rows, features)
-    return SparseTensor(sums / counts.to(features)[:, None], Grid({1: unique})), rows
+    wide = features.to(torch.promote_types(features.dtype, torch.float32))  # a sum may leave the range of float16
+    sums = wide.new_zeros(len(unique), features.shape[1]).index_add(0, rows, wide)
+    return SparseTensor((sums / counts.to(wide)[:, None]).to(features.dtype), Grid({1: unique})), rows
 
 
 class Conv(nn.Module):

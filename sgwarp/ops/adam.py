@@ -45,53 +45,85 @@ def values_of(parameters: Tensor, form: str) -> Tensor:
     return parameters.exp() if form == "logarithm" else parameters.sigmoid()
 
 
-def count_steps(v_opacities: Tensor, v_sh: Tensor, steps: Tensor, *, sparse: bool) -> Tensor:
-    """Count this step for those that take it.
+@dataclass(frozen=True, eq=False)
+class Taken:
+    """Who takes a step.
+
+    Attributes:
+        marks: 0 for those that wait, else 1, and 3 for those that the view has seen, uint8 [N].
+        steps: Of each Gaussian since it came, this one included, int32 [N].
+        waited: How many it makes up for, int32 [N]; valid where it takes the step, as the next.
+        moves: What becomes of them, see `waited_moves` in kernels/optimizing.py, float32 [N, 2].
+    """
+
+    marks: Tensor
+    steps: Tensor
+    waited: Tensor
+    moves: Tensor
+
+    @property
+    def seen(self) -> Tensor:
+        """Gaussians that the view has seen, bool [N]."""
+        return self.marks == int(kernels.SEEN)
+
+    @property
+    def count(self) -> int:
+        """How many take the step."""
+        return int((self.marks > 0).sum())
+
+
+def count_steps(v_opacities: Tensor, v_sh: Tensor, steps: Tensor, skipped: Tensor, *, sparse: bool) -> Taken:
+    """Count this step, for those that take it and for those that will make up for it.
 
     Args:
         v_opacities, v_sh: Gradients, float32 [N] and [N, K, 3].
-        steps: How many each Gaussian has taken, int32 [N]; added to.
+        steps: Of each Gaussian since it came, int32 [N]; added to.
+        skipped: How many of them it has yet to make up for, int32 [N]; changed.
         sparse: Only Gaussians that the view has seen take the step, else all.
-
-    Returns:
-        1 for each Gaussian that takes this step, uint8 [N].
     """
-    taken = torch.empty(len(steps), dtype=torch.uint8, device=steps.device)
+    count, device = len(steps), steps.device
+    taken = torch.empty(count, dtype=torch.uint8, device=device)
+    waited, moves = torch.empty_like(steps), torch.empty(count, 2, device=device)
     inputs = [view(v_opacities, wp.float32), view(v_sh, wp.vec3), int(not sparse)]
-    outputs = [view(steps, wp.int32), view(taken, wp.uint8)]
-    launch(kernels.count_steps, len(steps), inputs, outputs, device=steps.device)
-    return taken
+    outputs = [*(view(t, wp.int32) for t in (steps, skipped)), view(taken, wp.uint8)]
+    outputs += [view(waited, wp.int32), view(moves, wp.vec2)]
+    launch(kernels.count_steps, count, inputs, outputs, device=device)
+    return Taken(taken, steps, waited, moves)
 
 
 def update(
     group: Group,
     gradient: Tensor,
-    taken: Tensor,
-    steps: Tensor,
+    taken: Taken,
     rate: float,
     *,
     leading: int | None = None,
     rate_of_rest: float = 0.0,
     pull: float = 0.0,
 ) -> None:
-    """One step of Adam (betas 0.9 and 0.999, epsilon 1e-15) for the rows that take it.
+    """One step of Adam (betas 0.9 and 0.999, epsilon 1e-15) for the rows that take it, and those they waited for.
+
+    Rows end where they would if they had taken every step, with a gradient of zero where they were not seen; the rate
+    is taken to have been today's, and a pull to have met the moments of half way.
 
     Args:
         group: Parameters, values and moments, changed in place.
         gradient: Of the values, float32 [N, ...].
-        taken, steps: Of `count_steps`.
+        taken: Of `count_steps`.
         rate: Learning rate of the first `leading` columns, by default all.
         rate_of_rest: Of the others.
         pull: Added to the gradient.
     """
-    count = len(steps)
+    count, device = len(taken.marks), taken.marks.device
     if not count:
         return
     columns = group.parameters[0].numel()
     rows = [t.view(count, columns) for t in (group.parameters, group.first, group.second, group.values)]
     inputs = [
-        view(taken, wp.uint8),
-        view(steps, wp.int32),
+        view(taken.marks, wp.uint8),
+        view(taken.steps, wp.int32),
+        view(taken.waited, wp.int32),
+        view(taken.moves, wp.vec2),
         view(gradient.contiguous().view(count, columns), wp.float32),
         int(FORMS[group.form]),
         rate,
@@ -99,12 +131,12 @@ def update(
         rate_of_rest,
         pull,
     ]
-    launch(kernels.update_rows, count, inputs, [view(t, wp.float32) for t in rows], device=steps.device)
+    launch(kernels.update_rows, count, inputs, [view(t, wp.float32) for t in rows], device=device)
 
 
-def note_gradients(v_means2d: Tensor, taken: Tensor, width: int, height: int, sums: Tensor, views: Tensor) -> None:
+def note_gradients(v_means2d: Tensor, taken: Taken, width: int, height: int, sums: Tensor, views: Tensor) -> None:
     """Add the length of each seen centre's gradient, in halves of the image, to `sums` [N], and 1 to `views` [N]."""
-    inputs = [view(taken, wp.uint8), view(v_means2d, wp.vec2), wp.vec2(0.5 * width, 0.5 * height)]
+    inputs = [view(taken.marks, wp.uint8), view(v_means2d, wp.vec2), wp.vec2(0.5 * width, 0.5 * height)]
     outputs = [view(sums, wp.float32), view(views, wp.int32)]
     launch(kernels.note_gradients, len(sums), inputs, outputs, device=sums.device)
 

@@ -186,7 +186,8 @@ def scratch(name: str, count: int, dtype: torch.dtype, device: torch.device) -> 
     key = (name, dtype, device)
     held = store.get(key)
     if held is None or held.numel() < count:
-        held = torch.empty(max(count + count // 4, 1), dtype=dtype, device=device)
+        with torch.inference_mode(False):  # a tensor made under it could never be written to outside again
+            held = torch.empty(max(count + count // 4, 1), dtype=dtype, device=device)
         store[key] = held
     return held[:count]
 

@@ -10,6 +10,7 @@ from sgwarp.fitting.mcmc import MarkovChain, shared_opacity_and_scale
 from sgwarp.fitting.model import Gradients, Model
 from sgwarp.fitting.seeds import generator, number, view_at
 from sgwarp.fitting.settings import FitSettings
+from sgwarp.ops.adam import Taken, count_steps
 from sgwarp.scene import Camera, Gaussians
 
 CAMERA = Camera(torch.tensor([[40.0, 0, 20], [0, 40, 20], [0, 0, 1]]), torch.eye(4), 40, 40)
@@ -30,12 +31,14 @@ def cloud(count: int, scale: float = 0.02, opacity: float = 0.5) -> Model:
     )
 
 
-def pushed(model: Model, rows: list[int], by: float) -> tuple[Gradients, torch.Tensor]:
+def pushed(model: Model, rows: list[int], by: float) -> tuple[Gradients, Taken]:
     """Gradients that want the projections of some rows to move; all are seen."""
     v = torch.zeros(len(model), 2)
     v[rows, 0] = by
     fields = {name: torch.zeros_like(model[name]) for name in model.groups}
-    return Gradients(**fields, means2d=v), torch.ones(len(model), dtype=torch.uint8)
+    steps, skipped = (torch.zeros(len(model), dtype=torch.int32) for _ in range(2))
+    seen, v_sh = torch.ones(len(model)), torch.zeros(len(model), 1, 3)
+    return Gradients(**fields, means2d=v), count_steps(seen, v_sh, steps, skipped, sparse=True)
 
 
 def refine(strategy: Densify | MarkovChain, model: Model, rows: list[int], by: float, step: int = 600) -> None:
@@ -83,7 +86,7 @@ def test_gradients_are_averaged_over_the_views_that_saw_it():
     gradients, taken = pushed(model, [0, 1], 1.5e-5)
     strategy.after_step(model, 598, gradients, taken, CAMERA)
     gradients, taken = pushed(model, [1], 0.0)
-    taken[0] = 0  # the first is not seen in the second step, the second has no gradient there
+    taken.marks[0] = 0  # the first is not seen in the second step, the second has no gradient there
     strategy.after_step(model, 600, gradients, taken, CAMERA)
     assert len(model) == 5
 

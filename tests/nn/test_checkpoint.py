@@ -1,7 +1,11 @@
 """Checkpoints of MinkowskiEngine networks: prefixes, wrappers, and a clear word where they do not fit."""
 
+import argparse
+import collections
+import os
 import pickle
 
+import numpy as np
 import pytest
 import torch
 
@@ -29,6 +33,28 @@ def test_weights_of_torch_save(net, prefix, wrapper, tmp_path):
     loaded = read_weights(tmp_path / "net.pth")
     assert same(loaded, net)
     assert same(net_for(loaded).state_dict(), net)
+
+
+def test_what_training_scripts_store_beside_the_weights(net, tmp_path):
+    """OpenScene keeps the optimizer and the best IoU, a NumPy number; others their arguments."""
+    content = {
+        "epoch": 3,
+        "state_dict": {"net3d." + name: tensor for name, tensor in net.state_dict().items()},
+        "optimizer": {"state": {}, "param_groups": [{"lr": np.float32(1e-4)}]},
+        "best_iou": np.float64(0.5),
+        "args": argparse.Namespace(voxel=0.02),
+        "counts": collections.defaultdict(int, a=np.int64(1)),
+        "history": np.zeros(3),
+    }
+    torch.save(content, tmp_path / "net.pth")
+    assert same(read_weights(tmp_path / "net.pth"), net)
+
+
+def test_code_in_a_file_does_not_run(tmp_path):
+    torch.save({"state_dict": {}, "trap": os.system}, tmp_path / "net.pth")
+    with pytest.raises(InputError, match="no file of plain tensors") as error:
+        read_weights(tmp_path / "net.pth")
+    assert "\x1b" not in str(error.value)
 
 
 def test_weights_of_safetensors(net, tmp_path):

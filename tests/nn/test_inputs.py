@@ -140,7 +140,7 @@ def test_inputs_are_finite_for_flat_transparent_and_opaque_gaussians(mode):
 
 
 def test_unknown_inputs_are_refused():
-    with pytest.raises(InputError, match="full, xyz-rgb, raw56"):
+    with pytest.raises(InputError, match="full, xyz-rgb, raw56, ones, signed-rgb"):
         input_features(scene(1), "rgb", 0.02)
 
 
@@ -264,3 +264,33 @@ def test_deformations_that_do_not_fit_are_refused():
     gaussians = scene(5)
     with pytest.raises(InputError, match=r"expected means \[5, 3\]"):
         deformed(gaussians, gaussians.means[1:], torch.eye(3).expand(5, 3, 3))
+
+
+def test_a_map_that_changes_nothing_leaves_quaternions_and_scales():
+    gaussians = scene(400)
+    same = deformed(gaussians, gaussians.means, torch.eye(3).expand(400, 3, 3))
+    apart = (gaussians.scales.sort(dim=1).values.diff(dim=1) / gaussians.scales.amax(dim=1, keepdim=True)).amin(dim=1)
+    clear = apart > 0.02  # of two equal axes, neither is the first
+    assert float(clear.float().mean()) > 0.5
+    unit = torch.nn.functional.normalize(gaussians.quats, dim=1)
+    torch.testing.assert_close(same.scales, gaussians.scales, rtol=1e-3, atol=0)
+    torch.testing.assert_close(same.quats[clear], unit[clear], rtol=0, atol=1e-3)
+
+
+@pytest.mark.parametrize("mode", INPUT_CHANNELS)
+def test_gaussians_with_extreme_values_do_not_drown_their_neighbours(mode):
+    gaussians = scene(100)
+    plain = input_features(gaussians, mode, 0.02)
+    scales, sh = gaussians.scales.clone(), gaussians.sh.clone()
+    scales[0, 0], scales[1], sh[2] = 1e38, 1e25, 3e38
+    features = input_features(replace(gaussians, scales=scales, sh=sh), mode, 0.02)
+    assert bool(torch.isfinite(features).all())
+    assert float(features.abs().max()) <= 100
+    torch.testing.assert_close(features[3:], plain[3:])
+
+
+def test_inputs_of_openscene():
+    gaussians = scene(50)
+    assert bool((input_features(gaussians, "ones", 0.02) == 1).all())
+    signed = input_features(gaussians, "signed-rgb", 0.02)
+    torch.testing.assert_close(signed, (2 * input_features(gaussians, "xyz-rgb", 0.02) - 1).clamp(-1, 1))

@@ -11,7 +11,7 @@ import pytest
 import torch
 
 from sgwarp.cli import main
-from sgwarp.distill.data import TrainingScene, make_example, reliability
+from sgwarp.distill.data import TrainingScene, make_example, reliability, scenes_in
 from sgwarp.distill.settings import DistillSettings
 from sgwarp.distill.train import distill, state_path
 from sgwarp.errors import InputError
@@ -133,14 +133,46 @@ def test_scenes_of_a_step_share_it(scenes):
 def test_scenes_without_any_target_are_skipped(scenes, stage):
     g = stage.gaussians
     nothing = in_memory("unseen", g, lifted(g, stage.classes, torch.zeros(len(g), dtype=torch.bool)))
-    network, history = distill([nothing], replace(SETTINGS, epochs=1), validation=[nothing])
-    assert (history[0].loss, history[0].cosine, history[0].miou) == (None, None, None)
-    with torch.random.fork_rng():
-        torch.manual_seed(SETTINGS.seed)
-        untouched = MinkUNet(10, 4, "tiny").state_dict()
-    assert all(torch.equal(tensor, untouched[name]) for name, tensor in network.net.state_dict().items())
-    both = distill([nothing, *scenes], replace(SETTINGS, epochs=1, scenes_per_step=2))[1]
+    with pytest.raises(InputError, match="unseen: no Gaussian of this scene, or of any other"):
+        distill([nothing], replace(SETTINGS, epochs=1))
+    log = RunLog()
+    both = distill([nothing, *scenes], replace(SETTINGS, epochs=1, scenes_per_step=2), log=log)[1]
     assert both[0].loss is not None
+    assert log.left_out["scenes_without_target"] == 1
+
+
+def test_voxels_that_hold_no_gaussian_are_refused(scenes):
+    with pytest.raises(InputError, match="take larger voxels"):
+        distill(scenes, replace(SETTINGS, voxel=1e-9, epochs=1))
+
+
+def test_a_loss_that_is_not_finite_ends_the_run(scenes, tmp_path):
+    state = tmp_path / "s.pt"
+    with pytest.raises(InputError, match=r"the loss is not finite in epoch \d"):
+        distill(scenes, replace(SETTINGS, epochs=3, learning_rate=1e30), state=state)
+    if state.exists():
+        stored = torch.load(state, weights_only=True)["net"]
+        assert all(bool(torch.isfinite(t).all()) for t in stored.values())
+
+
+def test_lifted_features_that_are_not_finite_are_no_targets(scenes, stage):
+    g = stage.gaussians
+    semantics = lifted(g, stage.classes)
+    features = semantics.features.clone()
+    features[::50] = float("nan")
+    broken = in_memory("broken", g, replace(semantics, features=features))
+    _, history = distill([broken], replace(SETTINGS, epochs=1), validation=[broken])
+    assert math.isfinite(history[0].loss)
+    assert math.isfinite(history[0].cosine)
+
+
+def test_a_state_belongs_to_its_scenes_and_first_weights(scenes, tmp_path):
+    state = tmp_path / "s.pt"
+    network, _ = distill(scenes, replace(SETTINGS, epochs=1), state=state)
+    with pytest.raises(InputError, match="another scenes"):
+        distill(scenes[:2], replace(SETTINGS, epochs=1), state=state)
+    with pytest.raises(InputError, match="another first weights"):
+        distill(scenes, replace(SETTINGS, epochs=1), state=state, weights=network.net.state_dict())
 
 
 def test_targets_are_mean_directions_of_the_seen_gaussians(stage):
@@ -243,14 +275,12 @@ def test_distill_writes_a_network_and_its_curves(folder, capsys):
     curves = json.loads((out.parent / "net_curves.json").read_text())
     assert [set(row) >= {"loss", "cosine", "miou"} for row in curves] == [True, True]
     assert (out.parent / "net_curves.png").read_bytes()[:4] == b"\x89PNG"
-    assert state_path(out).is_file()
+    assert not state_path(out).exists()  # done
     log = json.loads((out.parent / "run.json").read_text())
     assert log["error"] == {name: curves[-1][name] for name in ("loss", "cosine", "miou")}
     assert {"prepare", "train", "validate", "write"} <= set(log["stages"])
-    assert (
-        main(["distill", *map(str, arguments), "--checkpoint", str(out)]) == 0
-    )  # finished already: nothing left to do
-    assert json.loads((out.parent / "run.json").read_text())["left_out"]["epochs_done_before"] == 2
+    assert main(["distill", *map(str, arguments)]) == 0  # begins anew
+    assert "epochs_done_before" not in json.loads((out.parent / "run.json").read_text())["left_out"]
 
 
 def test_distill_starts_from_a_checkpoint(folder, tmp_path):
@@ -275,6 +305,24 @@ def test_distill_names_what_is_missing(folder, capsys, tmp_path):
     assert "no such file" in fails(tmp_path / "none.ply")
     assert "no scenes to learn from" in fails()
     assert "name scenes with --validation" in fails(folder / "validation", "--classes", "x,y")
+
+
+def test_lifted_semantics_are_not_written_over(folder, capsys):
+    lifted_file = folder / "training" / "b.safetensors"
+    before = lifted_file.read_bytes()
+    assert main(["distill", str(folder / "training"), "--out", str(lifted_file), *OPTIONS]) == 2
+    assert "holds semantics that were lifted" in capsys.readouterr().err
+    assert lifted_file.read_bytes() == before
+
+
+def test_names_with_dots_keep_them(stage, tmp_path):
+    for name in ("a.v1.ply", "b.compressed.ply"):
+        save_gaussians(stage.gaussians, tmp_path / name)
+        g = load_gaussians(tmp_path / name)
+        save_semantics(
+            lifted(g, stage.classes), tmp_path / f"{name.removesuffix('.ply').removesuffix('.compressed')}.safetensors"
+        )
+    assert [scene.name.rpartition("/")[2] for scene in scenes_in([tmp_path])] == ["a.v1.ply", "b.compressed.ply"]
 
 
 def test_two_processes_train_as_one_does(folder):

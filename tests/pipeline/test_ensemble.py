@@ -88,6 +88,25 @@ def test_shares_of_labels_add_up_to_one_at_most():
     assert torch.equal(class_votes(projected, None), projected.features)
 
 
+def test_a_sum_of_shares_is_on_the_scale_of_shares():
+    """Fixed thresholds, such as one half, mean the same whichever ensemble asks."""
+    labels = ("1", "2", "3")
+    projected = semantics(torch.tensor([[0.6, 0.4, 0.0], [0.0, 0.0, 0.0]]), torch.tensor([True, False]), labels)
+    predicted = semantics(torch.tensor([[0.6, 0.2, 0.2], [0.3, 0.5, 0.2]]), torch.tensor([True, True]), labels)
+    for how in ("sum", "mean"):
+        one = class_votes(projected, ["1"], predicted=predicted, ensemble=how)
+        torch.testing.assert_close(one, torch.tensor([[0.6], [0.3]]))
+        every = class_votes(projected, None, predicted=predicted, ensemble=how)
+        torch.testing.assert_close(every[:, :1], one)
+
+
+def test_a_sum_of_evidence_has_twice_the_level_of_none(pair):
+    projected, _ = pair
+    alone = class_votes(projected, ["a", "b"], Axes(), 1.0, "evidence")
+    twice = class_votes(projected, ["a", "b"], Axes(), 2.0, "evidence", predicted=projected, ensemble="sum")
+    torch.testing.assert_close(twice, alone)
+
+
 def test_the_network_fills_in_what_no_view_saw(pair):
     projected, predicted = pair
     projected = replace(projected, weight=torch.tensor([4.0, 10.0, 0.0, 0.0]))

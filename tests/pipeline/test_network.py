@@ -3,10 +3,12 @@
 import pytest
 import torch
 
+import sgwarp as sg
 from sgwarp.cli import main
 from sgwarp.errors import InputError
 from sgwarp.io.store import load_semantics, save_semantics
 from sgwarp.network import SemanticNetwork, load_network, save_network
+from sgwarp.nn.inputs import voxelize
 from sgwarp.nn.mink_unet import MinkUNet
 from sgwarp.predict import predict
 from sgwarp.render import render
@@ -258,3 +260,55 @@ def test_predict_refuses_what_does_not_fit(files, stage_files, tmp_path, capsys)
     assert run("predict", scene, "--net", path, "--out", tmp_path / "s.safetensors", "--voxel", "0.5") == 2
     assert "trained with voxel 0.12" in capsys.readouterr().err
     assert not (tmp_path / "s.safetensors").exists()
+
+
+def test_a_checkpoint_of_three_channels_has_to_say_which(stage, tmp_path):
+    torch.save(network("ones", (3, 5)).net.state_dict(), tmp_path / "openscene.pth")
+    with pytest.raises(InputError, match="which may be xyz-rgb, ones, signed-rgb"):
+        load_network(tmp_path / "openscene.pth")
+    for inputs in ("ones", "signed-rgb", "xyz-rgb"):
+        loaded = load_network(tmp_path / "openscene.pth", inputs=inputs, voxel=0.12)
+        assert bool(torch.isfinite(predict(stage.gaussians, loaded).semantics().features).all())
+
+
+@pytest.mark.parametrize(("dtype", "bound"), [(torch.float64, 1e-4), (torch.bfloat16, 0.1)])
+def test_a_network_in_another_precision_predicts(net, stage, dtype, bound):
+    expected = predict(stage.gaussians, net).semantics().features
+    other = network()
+    other.net.to(dtype)
+    found = predict(stage.gaussians, other).semantics().features
+    assert found.dtype == torch.float32
+    assert float((found - expected).norm() / expected.norm()) < bound
+
+
+def test_weights_that_are_not_finite_are_refused(stage):
+    broken = network()
+    broken.net.conv0p1s1.kernel.data[0, 0, 0] = float("nan")
+    with pytest.raises(InputError, match="output is not finite"):
+        predict(stage.gaussians, broken)
+
+
+def test_rendered_labels_are_the_splatted_shares(stage):
+    named = network(channels=(10, 4), labels=LABELS)
+    prediction = predict(stage.gaussians, named)
+    camera = stage.views[0].camera
+    rendered = prediction.render(stage.gaussians, camera)
+    torch.testing.assert_close(rendered, render(stage.gaussians, camera, "features", prediction.semantics().features))
+
+
+def test_training_goes_on_after_a_prediction_in_inference_mode(net, stage):
+    with torch.inference_mode():
+        predict(stage.gaussians, net)
+        render(stage.gaussians, stage.views[0].camera)
+    again = network()
+    again.net.train()
+    leaf = stage.gaussians.sh.clone().requires_grad_()
+    g, camera = stage.gaussians, stage.views[0].camera
+    seen = sg.rasterize(
+        g.means, g.quats, g.scales, g.opacities, camera.world_to_camera, camera.K, camera.width, camera.height, sh=leaf
+    )
+    seen.features.sum().backward()
+    assert bool(leaf.grad.abs().max() > 0)
+    voxels, _ = voxelize(stage.gaussians, "full", 0.12)
+    with torch.autocast("cpu", dtype=torch.bfloat16):  # its products use scratch memory
+        again.net(voxels).features.float().sum().backward()
