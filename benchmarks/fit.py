@@ -38,7 +38,7 @@ HOLD_OUT = 8
 STEPS = 10_000
 MARKS = (1000, 3000, 7000, 10_000)  # steps whose quality is quoted
 SPEED_STEPS = 200
-SHORT = 2000  # steps of the comparison of sparse and dense updates
+SHORT = 1000  # steps of the comparison of sparse and dense updates
 CAPS = (10_000, 30_000)  # beside the 100,000 of the long runs
 FITS = {
     "mcmc": FitSettings(steps=STEPS, strategy="mcmc", cap=100_000),

@@ -73,6 +73,7 @@ def count_steps(
     taken_out: wp.array[wp.uint8],  # [N] 0, UNSEEN or SEEN
     waited_out: wp.array[int],  # [N] steps to make up for, where this one is taken
     moves_out: wp.array[wp.vec2],  # [N] `waited_moves` of them
+    factors_out: wp.array[wp.vec4],  # [N] that correct the bias of both means, and by which both fell while it waited
 ):
     """Who takes this step: a Gaussian that changes a pixel has a gradient of its opacity or of its colour."""
     i = base + wp.tid()
@@ -88,9 +89,14 @@ def count_steps(
     skipped_out[i] = 0
     taken_out[i] = wp.uint8(wp.where(seen, SEEN, UNSEEN))
     waited_out[i] = waited
+    by_first = 1.0 / (1.0 - wp.pow(BETA_1, float(age + 1)))
+    by_second = 1.0 / (1.0 - wp.pow(BETA_2, float(age + 1)))
     moves_out[i] = wp.vec2(0.0, 0.0)
+    factors_out[i] = wp.vec4(by_first, by_second, 1.0, 1.0)
     if waited > 0:
         moves_out[i] = waited_moves(age - waited, waited)
+        behind = float(waited)
+        factors_out[i] = wp.vec4(by_first, by_second, wp.pow(BETA_1, behind), wp.pow(BETA_2, behind))
 
 
 @wp.kernel
@@ -101,6 +107,7 @@ def update_rows(
     steps: wp.array[int],  # [N] since the Gaussian came, including this one
     waited: wp.array[int],  # [N] steps before this one that are still to be taken
     moves: wp.array[wp.vec2],  # [N] `waited_moves` of them
+    factors: wp.array[wp.vec4],  # [N] of `count_steps`
     gradient: wp.array2d[float],  # [N, P] of the values
     form: int,  # PLAIN, LOGARITHM or LOGIT
     rate: float,  # of the first `leading` columns
@@ -117,14 +124,16 @@ def update_rows(
     i = base + wp.tid()
     if taken[i] == wp.uint8(0):
         return
-    count = float(steps[i])
-    by_first = 1.0 / (1.0 - wp.pow(BETA_1, count))
-    by_second = 1.0 / (1.0 - wp.pow(BETA_2, count))
+    by_first = factors[i][0]
+    by_second = factors[i][1]
+    decay_1 = factors[i][2]
+    decay_2 = factors[i][3]
     behind = float(waited[i])
-    decay_1 = wp.pow(BETA_1, behind)
-    decay_2 = wp.pow(BETA_2, behind)
-    half_way = wp.pow(BETA_2, 0.5 * behind)
-    by_half_way = 1.0 / (1.0 - wp.pow(BETA_2, count - 1.0 - 0.5 * behind))
+    half_way = float(1.0)
+    by_half_way = float(1.0)
+    if pull != 0.0 and behind > 0.0:
+        half_way = wp.sqrt(decay_2)
+        by_half_way = 1.0 / (1.0 - wp.pow(BETA_2, float(steps[i]) - 1.0 - 0.5 * behind))
     for j in range(gradient.shape[1]):
         slope = float(1.0)
         if form == LOGARITHM:

@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import dataclasses
+import logging
 import math
+import os
 import time
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
@@ -19,7 +21,7 @@ from sgwarp.errors import InputError
 from sgwarp.fitting.checkpoint import Checkpoint, fingerprint
 from sgwarp.fitting.densify import Densify
 from sgwarp.fitting.exposure import Exposure
-from sgwarp.fitting.initial import adapted, gaussians_from_points, random_points
+from sgwarp.fitting.initial import RANDOM_SIZE, adapted, gaussians_from_points, random_points
 from sgwarp.fitting.interrupt import deferred_interrupt
 from sgwarp.fitting.mcmc import MarkovChain
 from sgwarp.fitting.measurement import Measurement as Measurement
@@ -42,6 +44,8 @@ from sgwarp.progress import Report
 from sgwarp.runlog import RunLog
 from sgwarp.scene import Gaussians, View
 
+logger = logging.getLogger("sgwarp")
+LARGEST_NEAR = 0.01  # near plane [extent of the cameras]
 REPORT_EVERY = 10  # steps between two reports of the progress
 MEMORY = 0.99  # of the loss that is reported
 
@@ -71,8 +75,9 @@ def fit(
     *,
     downscale: int = 1,
     masks: Masks | None = None,
-    checkpoint: Path | None = None,
+    checkpoint: str | os.PathLike[str] | None = None,
     checkpoint_every: int = 1000,
+    keep_checkpoint: bool = False,
     resume: bool = False,
     device: str | torch.device = "cpu",
     progress: Report | None = None,
@@ -89,9 +94,11 @@ def fit(
         held_out: Posed photographs to measure on; nothing is fitted to them.
         settings: Steps, strategy, cap and everything else.
         downscale: Divide width and height of the photographs by this.
-        masks: Which pixels of a view count, [H, W] of its photograph, zero for those that do not.
+        masks: Which pixels of a view count, also of those held out, [H, W] of its photograph, zero for those that do
+            not.
         checkpoint: File to keep the state of the run in, every `checkpoint_every` steps and when interrupted; it is
             removed when the run is complete.
+        keep_checkpoint: Leave it, of the last step, to whoever still has to write the scene.
         resume: Go on from that file.
         device: Where to compute.
         progress: Called as `progress(done, total, text)`.
@@ -103,34 +110,54 @@ def fit(
     """
     settings, log = settings or FitSettings(), log or RunLog()
     report = progress or (lambda done, total, text: None)
+    views, held_out = list(views), list(held_out)
+    if not all(isinstance(view, View) for view in (*views, *held_out)):
+        raise InputError("views: expected posed photographs, as load_views returns them")
+    if not (start is None or isinstance(start, Gaussians) or (isinstance(start, tuple) and len(start) == 2)):
+        raise InputError("start: expected points (positions and colours), a scene, or None")
+    path = None if checkpoint is None else Path(checkpoint)
     require_enough(views)
     if resume and checkpoint is None:
         raise InputError("resume: name the file of the checkpoint")
     if checkpoint_every < 1:
         raise InputError(f"checkpoint_every: expected at least 1, got {checkpoint_every}")
+    extent = camera_extent(views)
     with log.stage("read"):
-        photographs = read_photographs(views, downscale=downscale, masks=masks, device=device)
-        shown = read_photographs(held_out, downscale=downscale, device=device)
-    run = _Run(settings, photographs, shown, camera_extent(views), torch.device(device), log)
+        photographs, shown = (
+            [_near_enough(p, extent) for p in read_photographs(v, downscale=downscale, masks=masks, device=device)]
+            for v in (views, held_out)
+        )
+    run = _Run(settings, photographs, shown, extent, torch.device(device), log)
     with log.stage("start"):
         if resume:
-            assert checkpoint is not None
-            run.restore(checkpoint)
+            assert path is not None
+            run.restore(path)
         else:
-            run.begin(_starting(start, photographs, views, settings, run.extent, device))
+            if path is not None and path.exists():
+                logger.warning("%s: is left from a run that did not end, and is replaced; --resume would go on", path)
+            run.begin(_starting(start, photographs, shown, views, settings, run.extent, device))
     with deferred_interrupt() as interrupted:
-        complete = run.go(report, checkpoint, checkpoint_every, interrupted)
-    if checkpoint is not None and complete:
-        checkpoint.unlink(missing_ok=True)
-    elif checkpoint is not None:
-        run.save(checkpoint)
+        complete = run.go(report, path, checkpoint_every, interrupted)
+    if path is not None:
+        run.save(path)
     measured = run.measure()
+    if path is not None and complete and not keep_checkpoint:
+        path.unlink(missing_ok=True)
     return Fitted(run.model.gaussians(), run.curve, measured, complete)
+
+
+def _near_enough(photograph: Photograph, extent: float) -> Photograph:
+    """With a near plane that fits the scene, which may be smaller than one metre."""
+    camera = photograph.camera
+    return dataclasses.replace(
+        photograph, camera=dataclasses.replace(camera, near=min(camera.near, LARGEST_NEAR * extent))
+    )
 
 
 def _starting(
     start: Gaussians | tuple[Any, Any] | None,
     photographs: Sequence[Photograph],
+    held_out: Sequence[Photograph],
     views: Sequence[View],
     settings: FitSettings,
     extent: float,
@@ -138,11 +165,14 @@ def _starting(
 ) -> Gaussians:
     if isinstance(start, Gaussians):
         gaussians = adapted(start, settings).to(device)
-    else:
-        positions, colours = random_points(photographs, views, settings) if start is None else start
-        gaussians = gaussians_from_points(positions, colours, settings, extent, device)
-    if start is not None:
-        require_overlap(views, gaussians.means)
+        require_overlap(photographs, gaussians.means, held_out)
+        return gaussians
+    if start is None:
+        positions, colours = random_points(photographs, views, settings)
+        return gaussians_from_points(positions, colours, settings, extent, device, RANDOM_SIZE)
+    positions, colours = start
+    gaussians = gaussians_from_points(positions, colours, settings, extent, device)
+    require_overlap(photographs, torch.as_tensor(positions).to(torch.float32), held_out)  # before the cap thins them
     return gaussians
 
 
@@ -225,6 +255,7 @@ class _Run:
         model.raise_degree(settings.degree_at(self.step))
         leaves = {name: model[name].detach().requires_grad_() for name in model.groups}
         centres = torch.zeros(len(model), 2, device=self.device, requires_grad=self.strategy.wants_means2d)
+        background = self._background()
         image = rasterize_with_gradients(
             leaves["means"],
             leaves["quats"],
@@ -235,7 +266,7 @@ class _Run:
             camera.width,
             camera.height,
             sh=leaves["sh"],
-            background=self._background(),
+            background=background,
             means2d=centres if self.strategy.wants_means2d else None,
             near=camera.near,
             far=camera.far,
@@ -244,7 +275,7 @@ class _Run:
         if self.exposure is not None:
             colour_map = self.exposure.leaf(index)
             image = self.exposure.apply(colour_map, image)
-        truth = photograph.image()
+        truth = photograph.image(background)
         if photograph.mask is not None:
             image = torch.where(photograph.mask[..., None], image, truth)  # no difference, and no gradient
         loss = photometric_loss(image, truth, settings.similarity_share)
@@ -260,7 +291,7 @@ class _Run:
         self.loss = value if math.isnan(self.loss) else MEMORY * self.loss + (1 - MEMORY) * value
         self.step += 1
         if self.step % REPORT_EVERY == 0:
-            self.psnr = psnr(image.detach(), truth)
+            self.psnr = psnr(image.detach(), truth, photograph.mask)
         return partial(self.strategy.after_step, model, self.step, gradients, taken, camera)
 
     def _background(self) -> Tensor | None:
@@ -278,7 +309,7 @@ class _Run:
         with self.log.stage("measure"):
             for photograph in self.held_out:
                 image = rasterize(gaussians, photograph.camera, background=background).features
-                values[photograph.stem] = psnr(image, photograph.image())
+                values[photograph.stem] = psnr(image, photograph.image(background), photograph.mask)
         mean = sum(values.values()) / len(values) if values else math.nan
         if not self.curve or self.curve[-1].step != self.step:
             self.curve.append(Measurement(self.step, self.seconds, mean, self.loss, len(gaussians)))

@@ -11,14 +11,17 @@ import tyro
 
 from sgwarp.commands.options import Options, check_name, find_views
 from sgwarp.errors import InputError
+from sgwarp.io.points import PLY_NAMES
 from sgwarp.progress import show_progress
 
 if TYPE_CHECKING:
     from sgwarp.fit import Fitted
+    from sgwarp.fitting.photographs import Masks
     from sgwarp.fitting.settings import FitSettings
     from sgwarp.runlog import RunLog
     from sgwarp.scene import View
 
+DEGREE_EVERY = 1000  # steps between two rises of the degree of the colours
 EVALUATE_EVERY = 500  # steps between two measurements, less in short runs
 
 
@@ -37,7 +40,8 @@ class Fit(Options):
     """Scene to write, .ply (or .compressed.ply, quantised)."""
 
     steps: int = 10_000
-    """How many photographs to look at; all schedules follow."""
+    """How many photographs to look at; all schedules follow, and the degree of the colours rises every 1,000 steps, or
+    sooner in a short run."""
 
     hold_out: int = 8
     """Measure on every n-th view, from the first on, and fit to the others; 0 fits to all."""
@@ -46,7 +50,8 @@ class Fit(Options):
     """How Gaussians come and go. mcmc: the transparent move, up to the cap. default: clone, split, remove, reset."""
 
     cap: int = 100_000
-    """Never more Gaussians than this: trades quality for time and size."""
+    """Never more Gaussians than this: trades quality for time and size. Of more points so many are taken, to which
+    --strategy default then adds none."""
 
     sh_degree: Literal[0, 1, 2, 3] = 3
     """Highest degree of the view-dependent colours; 0 gives small files."""
@@ -86,6 +91,8 @@ class Fit(Options):
 
     def run(self) -> None:
         check_name("--out", self.out, ".ply")
+        if self.out.name in PLY_NAMES and self.out.parent.resolve() == self.views.resolve():
+            raise InputError(f"--out {self.out}: is a name of the points that a fit starts from; choose another")
         if self.hold_out < 0:
             raise InputError(f"--hold-out: expected 0 or more, got {self.hold_out}")
         with self.logged(self.out.parent) as log:
@@ -107,9 +114,11 @@ class Fit(Options):
                 sparse=self.sparse,
                 seed=self.seed,
                 evaluate_every=min(EVALUATE_EVERY, max(1, self.steps // 10)),
+                degree_every=min(DEGREE_EVERY, max(1, self.steps // (self.sh_degree + 1))),
             )
-            masks = masks_from_folder(self.masks, kept) if self.masks is not None else None
+            masks = masks_from_folder(self.masks, views) if self.masks is not None else None
             start = self._start(kept, settings, log)
+            checkpoint = self.out.with_name(f"{self.out.name}.checkpoint")
             with show_progress("fit") as progress:
                 fitted = fit(
                     kept,
@@ -118,14 +127,17 @@ class Fit(Options):
                     settings,
                     downscale=self.downscale,
                     masks=masks,
-                    checkpoint=self.out.with_name(f"{self.out.name}.checkpoint"),
+                    checkpoint=checkpoint,
                     checkpoint_every=self.checkpoint_every,
+                    keep_checkpoint=True,
                     resume=self.resume,
                     device=self.device,
                     progress=progress,
                     log=log,
                 )
-            self._write(fitted, held_out, log)
+            self._write(fitted, held_out, masks, log)
+            if fitted.complete:
+                checkpoint.unlink(missing_ok=True)
         if not fitted.complete:
             raise KeyboardInterrupt
 
@@ -150,7 +162,7 @@ class Fit(Options):
             assert self.depth is not None
             return gaussians_from_depth(views, depth_from_folder(self.depth), count=settings.cap)
 
-    def _write(self, fitted: Fitted, held_out: list[View], log: RunLog) -> None:
+    def _write(self, fitted: Fitted, held_out: list[View], masks: Masks | None, log: RunLog) -> None:
         from sgwarp.fitting.photographs import read_photographs
         from sgwarp.fitting.report import draw_curve, write_contact_sheet
         from sgwarp.io.scenes import save_gaussians
@@ -161,7 +173,7 @@ class Fit(Options):
             log.outputs.append(str(self.out))
             if held_out:
                 sheet = self.out.with_name(f"{self.out.stem}.held_out.jpg")
-                photographs = read_photographs(held_out, downscale=self.downscale, device=self.device)
+                photographs = read_photographs(held_out, downscale=self.downscale, masks=masks, device=self.device)
                 write_contact_sheet(fitted.gaussians, photographs, sheet, white=self.background == "white")
                 log.outputs.append(str(sheet))
             if held_out and _has_matplotlib():

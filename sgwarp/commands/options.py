@@ -186,6 +186,8 @@ def check_name(option: str, path: Path, suffix: str) -> None:
     """
     if path.suffix != suffix:
         raise InputError(f"{option} {path}: the name must end in {suffix}")
+    if path.is_dir():
+        raise InputError(f"{option} {path}: is a folder; choose another name")
     check_folder(option, path.parent)
 
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 import hashlib
 import pickle
+import struct
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -60,7 +61,7 @@ class Checkpoint:
         with reading(path):
             try:
                 content = torch.load(path, map_location=device, weights_only=True)
-            except (RuntimeError, EOFError, ValueError, KeyError, pickle.UnpicklingError):
+            except (RuntimeError, EOFError, ValueError, KeyError, pickle.UnpicklingError, struct.error):
                 raise InputError(f"{path}: is not a checkpoint, or is damaged; start again without --resume") from None
         names = {field.name for field in dataclasses.fields(cls)}
         if not isinstance(content, dict) or content.pop("format", None) != FORMAT or set(content) != names:

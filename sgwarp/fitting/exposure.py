@@ -39,8 +39,9 @@ class Exposure:
         marks = torch.zeros(len(self.steps), dtype=torch.uint8, device=self.steps.device)
         marks[index] = 1
         self.steps[index] += 1
-        none = torch.zeros_like(self.steps)
-        taken = Taken(marks, self.steps, none, none.float()[:, None].expand(-1, 2).contiguous())
+        none, count = torch.zeros_like(self.steps), self.steps.float()
+        factors = torch.stack([1 / (1 - 0.9**count), 1 / (1 - 0.999**count), count * 0 + 1, count * 0 + 1], dim=1)
+        taken = Taken(marks, self.steps, none, count.new_zeros(len(count), 2), factors)
         gradients = torch.zeros_like(self.group.parameters)
         gradients[index] = gradient
         rate = math.exp((1 - share) * math.log(RATE) + share * math.log(LAST_RATE))

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -17,10 +18,11 @@ from sgwarp.fitting.settings import FitSettings
 from sgwarp.from_depth import SH_C0
 from sgwarp.io.images import read_ids
 from sgwarp.ops.neighbors import mean_squared_neighbor_distance
-from sgwarp.scene import Gaussians, View
+from sgwarp.scene import SH_COUNTS, Gaussians, View
 
 OPACITY = {"default": 0.1, "mcmc": 0.5}  # of the reference implementations
 SIZE = 1.0  # in root mean square distances to the three nearest others
+RANDOM_SIZE = 0.35  # of random points: larger ones, right in front of a camera, would hide the scene from it
 LEAST_DISTANCE = 1e-4  # [extent of the cameras], for points in the same place
 LEAST_POINTS = 4  # that three neighbours need
 RANDOM_COUNT = 50_000
@@ -29,7 +31,12 @@ MILLIMETRE = 1e-3  # [m], the unit of depth images
 
 
 def gaussians_from_points(
-    positions: Any, colours: Any, settings: FitSettings, extent: float, device: str | torch.device = "cpu"
+    positions: Any,
+    colours: Any,
+    settings: FitSettings,
+    extent: float,
+    device: str | torch.device = "cpu",
+    size: float = SIZE,
 ) -> Gaussians:
     """A round Gaussian of SH degree 0 at every point, as large as the distance to its neighbours.
 
@@ -37,16 +44,28 @@ def gaussians_from_points(
         positions: [m], [N, 3]. Of more points than `settings.cap`, so many are drawn at random.
         colours: In [0, 1], [N, 3].
         extent: Of the cameras [m].
+        size: Scale, in root mean square distances to the three nearest others.
 
     Raises:
-        InputError: Fewer than 4 points, or one that is not finite.
+        InputError: Fewer than 4 points or a cap below, one that is not finite, or colours that are not in [0, 1].
     """
-    positions = torch.as_tensor(np.asarray(positions), dtype=torch.float64)
-    colours = torch.as_tensor(np.asarray(colours), dtype=torch.float32)
+    positions, colours = (t.detach().cpu() if isinstance(t, Tensor) else np.asarray(t) for t in (positions, colours))
+    positions = torch.as_tensor(positions, dtype=torch.float64)
+    colours = torch.as_tensor(colours, dtype=torch.float32)
     if positions.ndim != 2 or positions.shape[1] != 3 or colours.shape != positions.shape:
         raise InputError(f"points: expected [N, 3] twice, got {list(positions.shape)} and {list(colours.shape)}")
     if len(positions) < LEAST_POINTS:
         raise InputError(f"points: a scene starts from at least {LEAST_POINTS}, got {len(positions)}; or from none")
+    if settings.cap < LEAST_POINTS:
+        raise InputError(f"cap: a scene starts from at least {LEAST_POINTS} points, got {settings.cap}")
+    for name, values in (("positions", positions), ("colours", colours)):
+        if not bool(torch.isfinite(values).all()):
+            row = int((~torch.isfinite(values)).any(dim=1).nonzero()[0])
+            raise InputError(f"points: {name} of point {row} are not finite; leave it out")
+    if not bool(((colours >= 0) & (colours <= 1)).all()):
+        raise InputError(
+            f"points: colours lie in {float(colours.min()):g} to {float(colours.max()):g}, not in [0, 1]; divide by 255"
+        )
     if len(positions) > settings.cap:
         drawn = torch.randperm(len(positions), generator=generator(settings.seed, 0, "points"))[: settings.cap]
         kept = drawn.sort().values
@@ -56,7 +75,7 @@ def gaussians_from_points(
     gaussians = Gaussians(
         means=positions.to(torch.float32),
         quats=torch.tensor([1.0, 0.0, 0.0, 0.0]).expand(count, 4),
-        scales=(SIZE * distance)[:, None].expand(count, 3),
+        scales=(size * distance)[:, None].expand(count, 3),
         opacities=torch.full((count,), OPACITY[settings.strategy]),
         sh=((colours - 0.5) / SH_C0)[:, None, :],
     )
@@ -101,7 +120,7 @@ def adapted(gaussians: Gaussians, settings: FitSettings) -> Gaussians:
         raise InputError(f"the scene to start from has {len(gaussians)} Gaussians, more than the cap {settings.cap}")
     if gaussians.non_finite:
         raise InputError(f"{gaussians.non_finite} Gaussians to start from hold NaN or infinity; remove them first")
-    return gaussians
+    return replace(gaussians, sh=gaussians.sh[:, : SH_COUNTS[settings.sh_degree]])
 
 
 def depth_from_folder(folder: Path) -> Callable[[View], Any]:

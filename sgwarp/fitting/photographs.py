@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -12,10 +13,11 @@ import torch
 from torch import Tensor
 
 from sgwarp.errors import InputError
-from sgwarp.io.images import read_ids
+from sgwarp.io.images import read_alpha, read_ids
 from sgwarp.progress import Report
 from sgwarp.scene import Camera, View
 
+logger = logging.getLogger("sgwarp")
 LEAST_VIEWS = 3  # with fewer, nearly any scene explains them
 EXTENT_MARGIN = 1.1  # of the reference implementation
 
@@ -31,16 +33,24 @@ class Photograph:
         camera: At the size of `pixels`.
         pixels: uint8 [H, W, 3].
         mask: Which pixels count, bool [H, W], or None for all.
+        alpha: How opaque the pixels are, float32 [H, W] in [0, 1], or None where all are.
+        path: Its file.
     """
 
     stem: str
     camera: Camera
     pixels: Tensor
     mask: Tensor | None = None
+    alpha: Tensor | None = None
+    path: Path | None = None
 
-    def image(self) -> Tensor:
-        """float32 [H, W, 3] in [0, 1]."""
-        return self.pixels.to(torch.float32) / 255.0
+    def image(self, background: Tensor | None = None) -> Tensor:
+        """float32 [H, W, 3] in [0, 1]; transparent pixels show the background, float32 [3], black if None."""
+        image = self.pixels.to(torch.float32) / 255.0
+        if self.alpha is None:
+            return image
+        image = image * self.alpha[..., None]
+        return image if background is None else image + (1.0 - self.alpha[..., None]) * background
 
 
 def read_photographs(
@@ -78,6 +88,9 @@ def _read(view: View, downscale: int, masks: Masks | None, device: str | torch.d
     if view.image_path is None:
         raise InputError(f"view {view.stem}: has no photograph; a scene is fitted to photographs")
     pixels = (view.image().numpy() * 255.0).round().astype(np.uint8)
+    alpha: Any = read_alpha(view.image_path)
+    if alpha is not None and view.undistort is not None:
+        alpha = view.undistort(np.repeat(alpha[..., None], 3, axis=2))[..., 0]
     mask = None if masks is None else masks(view)
     if mask is not None:
         mask = np.asarray(mask) != 0
@@ -93,8 +106,13 @@ def _read(view: View, downscale: int, masks: Masks | None, device: str | torch.d
         pixels = cv2.resize(pixels, (width, height), interpolation=cv2.INTER_AREA)
         if mask is not None:
             mask = cv2.resize(mask.astype(np.float32), (width, height), interpolation=cv2.INTER_AREA) > 0.5
+            if not mask.any():
+                raise InputError(f"view {view.stem}: its mask leaves no pixel at this size; take a smaller downscale")
+        if alpha is not None:
+            alpha = cv2.resize(alpha, (width, height), interpolation=cv2.INTER_AREA)
     known = None if mask is None else torch.from_numpy(mask).to(device)
-    return Photograph(view.stem, camera, torch.from_numpy(pixels).to(device), known)
+    opaque = None if alpha is None else torch.from_numpy(np.ascontiguousarray(alpha)).to(device, torch.float32) / 255.0
+    return Photograph(view.stem, camera, torch.from_numpy(pixels).to(device), known, opaque, Path(view.image_path))
 
 
 def masks_from_folder(folder: Path, views: Sequence[View]) -> Masks:
@@ -104,8 +122,11 @@ def masks_from_folder(folder: Path, views: Sequence[View]) -> Masks:
         InputError: No view has a mask there.
     """
     paths = {view.stem: folder / f"{view.stem}.png" for view in views}
-    if not any(path.is_file() for path in paths.values()):
+    missing = [path.name for path in paths.values() if not path.is_file()]
+    if len(missing) == len(paths):
         raise InputError(f"{folder}: holds no mask of any view; expected files such as {views[0].stem}.png")
+    if missing:
+        logger.warning("%s: %d of %d views have no mask (%s, ...)", folder, len(missing), len(paths), missing[0])
 
     def mask(view: View) -> Any:
         path = paths.get(view.stem)
@@ -124,14 +145,20 @@ def require_enough(views: Sequence[View]) -> None:
         )
 
 
-def require_overlap(views: Sequence[View], means: Tensor) -> None:
-    """Raise InputError naming the photographs that show none of the points [N, 3] that the scene starts from."""
-    blind = [view for view in views if not bool(_shown(view.camera, means).any())]
-    if blind:
-        first = blind[0].image_path or blind[0].stem
+def require_overlap(photographs: Sequence[Photograph], means: Tensor, held_out: Sequence[Photograph] = ()) -> None:
+    """Raise InputError naming a photograph that shows none of the points [N, 3] that the scene starts from.
+
+    Of photographs that nothing is fitted to, only warn.
+    """
+    for blind in (p for p in held_out if not bool(_shown(p.camera, means).any())):
+        logger.warning("held-out view %s shows none of the points to start from: is its pose right?", blind.stem)
+    blinds = [p for p in photographs if not bool(_shown(p.camera, means).any())]
+    if blinds:
+        camera, first = blinds[0].camera, blinds[0].path or blinds[0].stem
         raise InputError(
-            f"{first}: shows none of the {len(means)} points that the scene starts from ({len(blind)} of {len(views)} "
-            "photographs do not); correct its pose, remove it, or start without points (--init random)"
+            f"{first}: shows none of the {len(means)} points that the scene starts from, between "
+            f"{camera.near:g} and {camera.far:g} m of depth ({len(blinds)} of {len(photographs)} photographs do not); "
+            "correct its pose, remove it, or start without points (--init random)"
         )
 
 

@@ -48,12 +48,12 @@ def _row(gaussians: Gaussians, photograph: Photograph, white: bool) -> Picture:
 
     background = gaussians.means.new_ones(3) if white else None
     image = rasterize(gaussians, photograph.camera, background=background).features
-    truth = photograph.image()
+    truth = photograph.image(background)
     error = (image.clamp(0, 1) - truth).abs().mean(dim=2).cpu().numpy() / LARGEST_ERROR
     colours = cv2.applyColorMap((error.clip(0, 1) * 255).astype(np.uint8), cv2.COLORMAP_INFERNO)[:, :, ::-1]
     titles = (
         f"photograph {photograph.stem}",
-        f"rendering, {psnr(image, truth):.1f} dB",
+        f"rendering, {psnr(image, truth, photograph.mask):.1f} dB",
         f"difference, 0 to {LARGEST_ERROR:g} and more",
     )
     height = max(1, round(TILE_WIDTH * photograph.camera.height / photograph.camera.width))

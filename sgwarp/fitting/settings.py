@@ -73,9 +73,12 @@ class FitSettings:
         for name, choices in (("strategy", Strategy), ("background", Background)):
             if getattr(self, name) not in get_args(choices):
                 raise InputError(f"{name}: '{getattr(self, name)}' is not one of {', '.join(get_args(choices))}")
-        for name in ("steps", "cap", "evaluate_every", "refine_every", "degree_every"):
-            if getattr(self, name) < 1:
-                raise InputError(f"{name}: expected at least 1, got {getattr(self, name)}")
+        for name in ("steps", "cap", "sh_degree", "seed", "evaluate_every", "refine_every", "degree_every"):
+            value = getattr(self, name)
+            if not isinstance(value, int):
+                raise InputError(f"{name}: expected a whole number, got {value!r}")
+            if value < 1 and name not in ("sh_degree", "seed"):
+                raise InputError(f"{name}: expected at least 1, got {value}")
         if not 0 <= self.sh_degree <= 3:
             raise InputError(f"sh_degree: expected 0 to 3, got {self.sh_degree}")
         if not 0 <= self.similarity_share <= 1:

@@ -22,6 +22,7 @@ JPEG_SIGNATURE = b"\xff\xd8\xff"
 START_OF_SCAN = 0xDA
 START_OF_FRAME = frozenset(range(0xC0, 0xD0)) - {0xC4, 0xC8, 0xCC}  # baseline, progressive, ...
 HEADER_BYTES = 1 << 18
+ALPHA_SUFFIXES = (".png", ".webp", ".tif", ".tiff")
 RGB_SUFFIXES = (".png", ".jpg", ".jpeg")
 
 
@@ -38,6 +39,23 @@ def read_rgb(path: str | os.PathLike[str]) -> NDArray[np.uint8]:
 
     pixels = _decode(path, read_bytes(path), cv2.IMREAD_COLOR | cv2.IMREAD_IGNORE_ORIENTATION)
     return np.ascontiguousarray(pixels[:, :, ::-1])
+
+
+def read_alpha(path: str | os.PathLike[str]) -> NDArray[np.uint8] | None:
+    """How opaque the pixels of a photograph are, uint8 [H, W]; None if all are, or the format cannot tell.
+
+    Raises:
+        InputError: The file is missing, cut short, or not an image.
+    """
+    import cv2
+
+    if Path(path).suffix.lower() not in ALPHA_SUFFIXES:
+        return None
+    pixels = _decode(path, read_bytes(path), cv2.IMREAD_UNCHANGED | cv2.IMREAD_IGNORE_ORIENTATION)
+    if pixels.ndim != 3 or pixels.shape[2] != 4:
+        return None
+    alpha = pixels[:, :, 3] if pixels.dtype == np.uint8 else (pixels[:, :, 3] >> 8).astype(np.uint8)
+    return None if bool((alpha == 255).all()) else np.ascontiguousarray(alpha)
 
 
 def read_size(path: str | os.PathLike[str]) -> tuple[int, int]:

@@ -63,7 +63,7 @@ def _bystanders() -> list[Any]:
         for module in ("numpy._core", "numpy.core")
     ]
     dtypes = [type(np.dtype(kind)) for kind in kinds]
-    return [*functions, *dtypes, np.dtype, np.ndarray, argparse.Namespace, collections.defaultdict]
+    return [*functions, *dtypes, np.dtype, np.ndarray, argparse.Namespace, collections.defaultdict, int, float]
 
 
 def without_prefixes(state: dict[str, Tensor]) -> dict[str, Tensor]:

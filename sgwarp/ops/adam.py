@@ -9,8 +9,11 @@ import warp as wp
 from torch import Tensor
 
 from sgwarp.kernels import optimizing as kernels
+from sgwarp.kernels import optimizing_lanes
+from sgwarp.kernels.transmittance import Lanes
 from sgwarp.ops.launch import launch, view
 
+LANE = 16
 FORMS = {"plain": kernels.PLAIN, "logarithm": kernels.LOGARITHM, "logit": kernels.LOGIT}
 
 
@@ -54,12 +57,14 @@ class Taken:
         steps: Of each Gaussian since it came, this one included, int32 [N].
         waited: How many it makes up for, int32 [N]; valid where it takes the step, as the next.
         moves: What becomes of them, see `waited_moves` in kernels/optimizing.py, float32 [N, 2].
+        factors: That correct the bias of both means, and by which both fell meanwhile, float32 [N, 4].
     """
 
     marks: Tensor
     steps: Tensor
     waited: Tensor
     moves: Tensor
+    factors: Tensor
 
     @property
     def seen(self) -> Tensor:
@@ -83,12 +88,13 @@ def count_steps(v_opacities: Tensor, v_sh: Tensor, steps: Tensor, skipped: Tenso
     """
     count, device = len(steps), steps.device
     taken = torch.empty(count, dtype=torch.uint8, device=device)
-    waited, moves = torch.empty_like(steps), torch.empty(count, 2, device=device)
+    waited = torch.empty_like(steps)
+    moves, factors = torch.empty(count, 2, device=device), torch.empty(count, 4, device=device)
     inputs = [view(v_opacities, wp.float32), view(v_sh, wp.vec3), int(not sparse)]
     outputs = [*(view(t, wp.int32) for t in (steps, skipped)), view(taken, wp.uint8)]
-    outputs += [view(waited, wp.int32), view(moves, wp.vec2)]
+    outputs += [view(waited, wp.int32), view(moves, wp.vec2), view(factors, wp.vec4)]
     launch(kernels.count_steps, count, inputs, outputs, device=device)
-    return Taken(taken, steps, waited, moves)
+    return Taken(taken, steps, waited, moves, factors)
 
 
 def update(
@@ -118,12 +124,16 @@ def update(
     if not count:
         return
     columns = group.parameters[0].numel()
+    if columns % LANE == 0 and group.form == "plain" and not pull and device.type == "cpu":
+        _update_wide(group, gradient, taken, columns, rate, columns if leading is None else leading, rate_of_rest)
+        return
     rows = [t.view(count, columns) for t in (group.parameters, group.first, group.second, group.values)]
     inputs = [
         view(taken.marks, wp.uint8),
         view(taken.steps, wp.int32),
         view(taken.waited, wp.int32),
         view(taken.moves, wp.vec2),
+        view(taken.factors, wp.vec4),
         view(gradient.contiguous().view(count, columns), wp.float32),
         int(FORMS[group.form]),
         rate,
@@ -132,6 +142,18 @@ def update(
         pull,
     ]
     launch(kernels.update_rows, count, inputs, [view(t, wp.float32) for t in rows], device=device)
+
+
+def _update_wide(
+    group: Group, gradient: Tensor, taken: Taken, columns: int, rate: float, leading: int, rate_of_rest: float
+) -> None:
+    rates = torch.full((columns,), rate_of_rest)
+    rates[:leading] = rate
+    shape = (len(taken.marks), columns // LANE, LANE)
+    inputs = [view(taken.marks, wp.uint8), view(taken.moves, wp.vec2), view(taken.factors, wp.vec4)]
+    inputs += [view(gradient.contiguous().view(shape), Lanes), view(rates.view(-1, LANE), Lanes)]
+    outputs = [view(t.view(shape), Lanes) for t in (group.parameters, group.first, group.second)]
+    launch(optimizing_lanes.update_wide_rows, shape[0], inputs, outputs, device=gradient.device)
 
 
 def note_gradients(v_means2d: Tensor, taken: Taken, width: int, height: int, sums: Tensor, views: Tensor) -> None:

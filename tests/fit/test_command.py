@@ -13,6 +13,7 @@ import pytest
 import torch
 
 from sgwarp.cli import main
+from sgwarp.errors import InputError
 from sgwarp.io.images import read_rgb
 from sgwarp.io.scenes import load_gaussians
 
@@ -93,6 +94,7 @@ def test_a_fit_starts_from_nothing(boards, tmp_path):
         (["--resume"], "scene.ply.checkpoint: no such file"),
         (["--checkpoint-every", "0"], "checkpoint_every: expected at least 1"),
         (["--masks", "."], "holds no mask of any view"),
+        (["--cap", "2"], "cap: a scene starts from at least 4 points"),
     ],
 )
 def test_bad_options(boards, tmp_path, capsys, monkeypatch, options, message):
@@ -138,3 +140,39 @@ def test_ctrl_c_leaves_a_scene_and_a_checkpoint(boards, tmp_path):
     assert len(checkpoint["model"]["steps"]) == len(scene)
     run = json.loads((tmp_path / "run.json").read_text())
     assert run["curve"][-1]["step"] == checkpoint["step"] < 4000
+
+
+def test_a_scene_that_cannot_be_written_costs_no_run(boards, tmp_path, capsys, monkeypatch):
+    """The checkpoint of the last step stays until the scene is on the disk."""
+    out = tmp_path / "scene.ply"
+    arguments = ["fit", str(boards.folder), "--out", str(out), "--steps", "20", "--cap", "1200"]
+
+    def full(*_: object) -> None:
+        raise InputError("no space left on device")
+
+    with monkeypatch.context() as patch:
+        patch.setattr("sgwarp.io.scenes.save_gaussians", full)
+        assert main(arguments) == 2
+    assert out.with_name("scene.ply.checkpoint").is_file()
+    assert main([*arguments, "--resume"]) == 0
+    assert len(load_gaussians(out)) > 1000
+    assert not out.with_name("scene.ply.checkpoint").exists()
+
+
+def test_names_that_would_be_taken_for_something_else(boards, tmp_path, capsys):
+    (tmp_path / "folder.ply").mkdir()
+    assert "is a folder; choose another name" in fails(capsys, boards.folder, "--out", tmp_path / "folder.ply")
+    folder = Path(shutil.copytree(boards.folder, tmp_path / "stage"))
+    assert "is a name of the points" in fails(capsys, folder, "--out", folder / "point_cloud.ply")
+
+
+def test_a_damaged_checkpoint(boards, tmp_path, capsys):
+    (tmp_path / "scene.ply.checkpoint").write_text("junk")
+    message = fails(capsys, boards.folder, "--out", tmp_path / "scene.ply", "--steps", "5", "--resume")
+    assert "is not a checkpoint, or is damaged" in message
+
+
+def test_short_runs_reach_their_degree(boards, tmp_path):
+    out = tmp_path / "scene.ply"
+    assert main(["fit", str(boards.folder), "--out", str(out), "--steps", "16", "--cap", "1200"]) == 0
+    assert load_gaussians(out).sh.shape[1] == 16

@@ -2,6 +2,7 @@
 
 import json
 import shutil
+from dataclasses import replace
 from pathlib import Path
 
 import cv2
@@ -229,3 +230,116 @@ def test_masked_pixels_do_not_count(boards):
         results.append(psnr(image[:20, :28], views[0].image()[:20, :28]))
     spoiled, masked = results
     assert masked > spoiled + 3
+
+
+def test_masks_count_on_held_out_views_too(boards):
+    """What covers part of every photograph says nothing about the scene, when it is measured either."""
+    mask = np.ones((48, 64), bool)
+    mask[:16] = False
+
+    def covered(view: View) -> View:
+        return View(
+            view.stem, view.camera, view.image_path, undistort=lambda p: np.where(mask[..., None], p, np.uint8(255))
+        )
+
+    views = [covered(view) for view in boards.views]
+    settings, points = FitSettings(steps=80, evaluate_every=80), load_points(boards.folder)
+    counted = fit(views[1:], points, views[:1], settings, masks=lambda view: mask).curve[-1].psnr
+    everything = fit(views[1:], points, views[:1], settings).curve[-1].psnr
+    clean = fit(boards.views[1:], points, boards.views[:1], settings).curve[-1].psnr
+    assert counted > clean - 2
+    assert counted > everything
+
+
+def test_masks_that_are_missing_are_counted(boards, tmp_path, caplog):
+    cv2.imwrite(str(tmp_path / "0000.png"), np.full((48, 64), 255, np.uint8))
+    masks_from_folder(tmp_path, boards.views)
+    assert "7 of 8 views have no mask (0001.png, ...)" in caplog.text
+
+
+def test_a_mask_that_vanishes_with_the_size(boards):
+    mask = np.zeros((48, 64), bool)
+    mask[5, 5] = True
+    with pytest.raises(InputError, match="its mask leaves no pixel at this size"):
+        read_photographs(boards.views[:1], downscale=4, masks=lambda view: mask)
+
+
+@pytest.mark.parametrize("downscale", [1, 2])
+def test_transparent_photographs_show_the_background(boards, tmp_path, downscale):
+    view = boards.views[0]
+    pixels = np.full((48, 64, 4), 200, np.uint8)
+    pixels[..., 3] = 255
+    pixels[:24, :, 3] = 0
+    pixels[24:36, :, 3] = 102
+    cv2.imwrite(str(tmp_path / "0000.png"), pixels)
+    (photograph,) = read_photographs([View("0000", view.camera, tmp_path / "0000.png")], downscale=downscale)
+    rows = [4 // downscale, 30 // downscale, 40 // downscale]
+    for background, expected in ((None, [0, 0.4 * 200 / 255, 200 / 255]), (1.0, [1, 0.4 * 200 / 255 + 0.6, 200 / 255])):
+        shown = photograph.image(None if background is None else torch.full((3,), background))
+        assert shown[rows, 5, 1].tolist() == pytest.approx(expected, abs=0.005)
+    (opaque,) = read_photographs(boards.views[:1])
+    assert opaque.alpha is None
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        (lambda p, c: (p, (c * 255).astype(np.uint8)), r"colours lie in \d+ to \d+, not in \[0, 1\]; divide by 255"),
+        (lambda p, c: (np.where(np.arange(len(p))[:, None] == 7, np.nan, p), c), "positions of point 7 are not finite"),
+        (lambda p, c: (p, np.where(np.arange(len(p))[:, None] == 9, np.inf, c)), "colours of point 9 are not finite"),
+        (lambda p, c: p, "start: expected points"),
+    ],
+)
+def test_points_that_make_no_sense(boards, change, message):
+    with pytest.raises(InputError, match=message):
+        fit(boards.views, change(*load_points(boards.folder)), settings=ONE_STEP)
+
+
+def test_a_cap_below_what_a_scene_needs(boards):
+    with pytest.raises(InputError, match="cap: a scene starts from at least 4 points, got 2"):
+        fit(boards.views, load_points(boards.folder), settings=FitSettings(steps=1, cap=2))
+
+
+def test_the_overlap_is_that_of_all_points(boards):
+    fitted = fit(boards.views, load_points(boards.folder), settings=FitSettings(steps=1, cap=4))
+    assert len(fitted.gaussians) == 4
+
+
+def test_a_scene_to_start_from_keeps_the_degree_that_was_asked_for(boards):
+    first = fit(boards.views, load_points(boards.folder), settings=FitSettings(steps=4, sh_degree=2, degree_every=1))
+    assert first.gaussians.sh.shape[1] == 9
+    again = fit(boards.views, first.gaussians, settings=FitSettings(steps=1, sh_degree=0))
+    assert again.gaussians.sh.shape[1] == 1
+
+
+def test_small_scenes_are_not_cut_by_the_near_plane(boards):
+    """The same stage in another unit: a thousandth of its size."""
+    views = []
+    for view in boards.views:
+        pose = view.camera.world_to_camera.clone()
+        pose[:3, 3] *= 1e-3
+        views.append(View(view.stem, replace(view.camera, world_to_camera=pose), view.image_path))
+    positions, colours = load_points(boards.folder)
+    settings = FitSettings(steps=60, evaluate_every=60)
+    small = fit(views[1:], (1e-3 * positions, colours), views[:1], settings).curve[-1].psnr
+    usual = fit(boards.views[1:], (positions, colours), boards.views[:1], settings).curve[-1].psnr
+    assert small == pytest.approx(usual, abs=1.0)
+
+
+def test_held_out_views_that_show_nothing_are_named(boards, caplog):
+    pose = boards.views[0].camera.world_to_camera.clone()
+    pose[:3, 3] += 500
+    away = View("away", replace(boards.views[0].camera, world_to_camera=pose), boards.views[0].image_path)
+    fit(boards.views, load_points(boards.folder), [away], ONE_STEP)
+    assert "held-out view away shows none" in caplog.text
+
+
+@pytest.mark.parametrize("bad", [{"steps": 10.5}, {"steps": float("nan")}, {"cap": 2e3}, {"sh_degree": 1.5}])
+def test_numbers_that_are_not_whole(bad):
+    with pytest.raises(InputError, match="expected a whole number"):
+        FitSettings(**bad)
+
+
+def test_things_that_are_no_views(boards):
+    with pytest.raises(InputError, match="views: expected posed photographs"):
+        fit([view.camera for view in boards.views], settings=ONE_STEP)

@@ -212,3 +212,12 @@ def test_all_views_come_in_turn_and_in_another_order():
     assert all(sorted(turn) == list(range(7)) for turn in turns)
     assert len({tuple(turn) for turn in turns}) > 1
     assert number(1, 2, "a") != number(1, 2, "b") != number(2, 2, "b")
+
+
+def test_few_points_grow_to_the_cap_by_half_of_a_short_run():
+    settings = FitSettings(strategy="mcmc", steps=1000, cap=800)
+    model, strategy = cloud(100), MarkovChain(settings, 1.0)
+    for step in range(1, 501):
+        if step % 100 == 0:
+            refine(strategy, model, [], 0.0, step)
+    assert len(model) == 800

@@ -89,6 +89,23 @@ def test_a_pull_reaches_rows_that_are_not_seen():
     assert never.parameters.item() == pytest.approx(-0.5, rel=0.05)  # fifty steps of the rate
 
 
+def test_many_columns_take_the_same_steps_as_few():
+    """48 columns go 16 at a time, 47 one at a time."""
+    random = torch.Generator().manual_seed(1)
+    parameters, gradients = torch.randn(ROWS, 48, generator=random), torch.randn(150, ROWS, 48, generator=random)
+    seen = torch.rand(150, ROWS, generator=random) < 0.3
+    results = []
+    for columns in (48, 47):
+        group, (steps, skipped) = Group.starting(parameters[:, :columns].clone()), counters(ROWS)
+        for gradient, shown in zip(gradients, seen, strict=True):
+            taken = count_steps(shown.float(), torch.zeros(ROWS, 1, 3), steps, skipped, sparse=True)
+            update(group, gradient[:, :columns], taken, 0.02, leading=3, rate_of_rest=0.01)
+        results.append(group)
+    wide, narrow = results
+    for name in ("parameters", "first", "second"):
+        torch.testing.assert_close(getattr(wide, name)[:, :47], getattr(narrow, name), rtol=1e-5, atol=1e-6)
+
+
 def test_rows_that_wait_stay_as_they_are():
     group, (steps, skipped) = Group.starting(torch.ones(2, 3)), counters(2)
     for _ in range(3):

@@ -319,9 +319,8 @@ def test_names_with_dots_keep_them(stage, tmp_path):
     for name in ("a.v1.ply", "b.compressed.ply"):
         save_gaussians(stage.gaussians, tmp_path / name)
         g = load_gaussians(tmp_path / name)
-        save_semantics(
-            lifted(g, stage.classes), tmp_path / f"{name.removesuffix('.ply').removesuffix('.compressed')}.safetensors"
-        )
+        beside = name.removesuffix(".ply").removesuffix(".compressed") + ".safetensors"
+        save_semantics(lifted(g, stage.classes), tmp_path / beside)
     assert [scene.name.rpartition("/")[2] for scene in scenes_in([tmp_path])] == ["a.v1.ply", "b.compressed.ply"]
 
 

@@ -283,7 +283,7 @@ def test_a_network_in_another_precision_predicts(net, stage, dtype, bound):
 
 def test_weights_that_are_not_finite_are_refused(stage):
     broken = network()
-    broken.net.conv0p1s1.kernel.data[0, 0, 0] = float("nan")
+    broken.net.bn0.bn.weight.data[0] = float("nan")
     with pytest.raises(InputError, match="output is not finite"):
         predict(stage.gaussians, broken)
 
