@@ -78,6 +78,24 @@ def open_row_mask(y: int, height: int) -> int:
 
 
 @wp.func
+def open_tile(
+    slot: int, x0: int, y0: int, width: int, height: int, planes: int, unset: int, state: wp.array3d[Lanes]
+) -> int:
+    """Scratch of a tile before its first fragment, and a bit for each of its rows in the image.
+
+    Plane 0 is the transmittance; the planes from `unset` on hold numbers of fragments, of which there is none.
+    """
+    for row in range(TILE):
+        state[slot, row, 0] = open_lanes(x0, width)
+        for plane in range(1, planes):
+            value = Lanes(0.0)
+            if plane >= unset:
+                value = Lanes(-1.0)
+            state[slot, row, plane] = value
+    return open_row_mask(y0, height)
+
+
+@wp.func
 def still_open(mask: int, state: wp.array3d[Lanes], slot: int) -> int:
     """Clear the bits of rows whose 16 pixels are all closed."""
     kept = mask
@@ -97,6 +115,7 @@ def color_walk(depth: bool, record: bool) -> wp.Function:
     `record` the last contributor. With both, the surface is kept as a contributor, not as a depth.
     """
     planes = color_planes(depth, record)
+    unset = planes - int(record) - int(record and depth)
     composite_row = row_walk(depth, record)
 
     @wp.func
@@ -116,15 +135,7 @@ def color_walk(depth: bool, record: bool) -> wp.Function:
         columns = (width + TILE - 1) / TILE
         x0 = (tile % columns) * TILE
         y0 = (tile / columns) * TILE
-        for row in range(TILE):
-            state[slot, row, 0] = open_lanes(x0, width)
-            for plane in range(1, planes):
-                state[slot, row, plane] = Lanes(0.0)
-            if wp.static(record):
-                state[slot, row, wp.static(planes - 1)] = Lanes(-1.0)
-                if wp.static(depth):
-                    state[slot, row, 5] = Lanes(-1.0)
-        open_rows = open_row_mask(y0, height)
+        open_rows = open_tile(slot, x0, y0, width, height, planes, unset, state)
         first = offsets[tile]
         stop = offsets[tile + 1]
         for start in range(first, stop, BATCH):

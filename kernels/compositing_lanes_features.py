@@ -9,7 +9,7 @@ from functools import cache
 import warp as wp
 
 from sgwarp.kernels.binning import TILE
-from sgwarp.kernels.compositing_lanes import BATCH, open_lanes, open_row_mask, write_last
+from sgwarp.kernels.compositing_lanes import BATCH, open_tile, write_last
 from sgwarp.kernels.compositing_rows import REACHING, gather_batch
 from sgwarp.kernels.gaussian import Splat
 from sgwarp.kernels.native import Seen, snippet
@@ -97,6 +97,7 @@ def feature_walk(slices: int, record: bool) -> wp.Function:
     Planes of the scratch: transmittance, the channels, with `record` the last contributor.
     """
     last_plane = 1 + PASS * slices
+    planes = last_plane + int(record)
 
     @wp.func_native(snippet(PREFETCH, SLICES=slices))
     def prefetch_features(
@@ -135,13 +136,7 @@ def feature_walk(slices: int, record: bool) -> wp.Function:
         columns = (width + TILE - 1) / TILE
         x0 = (tile % columns) * TILE
         y0 = (tile / columns) * TILE
-        for row in range(TILE):
-            state[slot, row, 0] = open_lanes(x0, width)
-            for plane in range(1, wp.static(1 + PASS * slices)):
-                state[slot, row, plane] = Lanes(0.0)
-            if wp.static(record):
-                state[slot, row, last_plane] = Lanes(-1.0)
-        open_rows = open_row_mask(y0, height)
+        open_rows = open_tile(slot, x0, y0, width, height, planes, last_plane, state)
         first = offsets[tile]
         stop = offsets[tile + 1]
         for start in range(first, stop, BATCH):

@@ -11,7 +11,7 @@ from functools import cache
 import warp as wp
 
 from sgwarp.kernels.binning import AHEAD, TILE, prefetch
-from sgwarp.kernels.compositing_lanes import CLOSE_EVERY, open_lanes, open_row_mask, still_open
+from sgwarp.kernels.compositing_lanes import CLOSE_EVERY, open_tile, still_open
 from sgwarp.kernels.gaussian import Splat
 from sgwarp.kernels.lifting_rows import fragment_lift, lift_fragment_ids
 from sgwarp.kernels.projection import Knobs
@@ -50,9 +50,7 @@ def make_lift_dense(slices: int) -> wp.Kernel:
         column = tile % columns
         x0 = column * TILE
         y0 = (tile / columns) * TILE
-        for row in range(TILE):
-            state[slot, row, 0] = open_lanes(x0, width)
-        open_rows = open_row_mask(y0, height)
+        open_rows = open_tile(slot, x0, y0, width, height, 1, 1, state)
         first = offsets[tile]
         stop = offsets[tile + 1]
         for k in range(first, stop):
@@ -104,9 +102,7 @@ def lift_ids(
     columns = (width + TILE - 1) / TILE
     x0 = (tile % columns) * TILE
     y0 = (tile / columns) * TILE
-    for row in range(TILE):
-        state[slot, row, 0] = open_lanes(x0, width)
-    open_rows = open_row_mask(y0, height)
+    open_rows = open_tile(slot, x0, y0, width, height, 1, 1, state)
     first = offsets[tile]
     stop = offsets[tile + 1]
     count = wp.max(stop - first, 1)

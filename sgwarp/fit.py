@@ -7,7 +7,7 @@ import logging
 import math
 import os
 import time
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from functools import partial
@@ -74,7 +74,7 @@ def fit(
     settings: FitSettings | None = None,
     *,
     downscale: int = 1,
-    masks: Masks | None = None,
+    masks: Masks | Mapping[str, Any] | None = None,
     checkpoint: str | os.PathLike[str] | None = None,
     checkpoint_every: int = 1000,
     keep_checkpoint: bool = False,
@@ -95,7 +95,7 @@ def fit(
         settings: Steps, strategy, cap and everything else.
         downscale: Divide width and height of the photographs by this.
         masks: Which pixels of a view count, also of those held out, [H, W] of its photograph, zero for those that do
-            not.
+            not; by the name of the view, or a function of the view. A view without one counts as a whole.
         checkpoint: File to keep the state of the run in, every `checkpoint_every` steps and when interrupted; it is
             removed when the run is complete.
         keep_checkpoint: Leave it, of the last step, to whoever still has to write the scene.
@@ -115,6 +115,7 @@ def fit(
         raise InputError("views: expected posed photographs, as load_views returns them")
     if not (start is None or isinstance(start, Gaussians) or (isinstance(start, tuple) and len(start) == 2)):
         raise InputError("start: expected points (positions and colours), a scene, or None")
+    given = (lambda view: masks.get(view.stem)) if isinstance(masks, Mapping) else masks
     path = None if checkpoint is None else Path(checkpoint)
     require_enough(views)
     if resume and checkpoint is None:
@@ -124,7 +125,7 @@ def fit(
     extent = camera_extent(views)
     with log.stage("read"):
         photographs, shown = (
-            [_near_enough(p, extent) for p in read_photographs(v, downscale=downscale, masks=masks, device=device)]
+            [_near_enough(p, extent) for p in read_photographs(v, downscale=downscale, masks=given, device=device)]
             for v in (views, held_out)
         )
     run = _Run(settings, photographs, shown, extent, torch.device(device), log)

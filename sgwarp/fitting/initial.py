@@ -24,6 +24,7 @@ OPACITY = {"default": 0.1, "mcmc": 0.5}  # of the reference implementations
 SIZE = 1.0  # in root mean square distances to the three nearest others
 RANDOM_SIZE = 0.35  # of random points: larger ones, right in front of a camera, would hide the scene from it
 LEAST_DISTANCE = 1e-4  # [extent of the cameras], for points in the same place
+VISIBLE = 1 / 255  # opacity from which on a Gaussian changes a pixel
 LEAST_POINTS = 4  # that three neighbours need
 RANDOM_COUNT = 50_000
 NEAREST, FARTHEST = 0.2, 4.0  # of random points [extent of the cameras]
@@ -112,7 +113,7 @@ def adapted(gaussians: Gaussians, settings: FitSettings) -> Gaussians:
     """A scene that exists already, as a fit can start from it.
 
     Raises:
-        InputError: It is empty or larger than the cap, or holds NaN or infinity.
+        InputError: It is empty or larger than the cap, holds NaN or infinity, or is transparent throughout.
     """
     if not len(gaussians):
         raise InputError("the scene to start from holds no Gaussians")
@@ -120,6 +121,10 @@ def adapted(gaussians: Gaussians, settings: FitSettings) -> Gaussians:
         raise InputError(f"the scene to start from has {len(gaussians)} Gaussians, more than the cap {settings.cap}")
     if gaussians.non_finite:
         raise InputError(f"{gaussians.non_finite} Gaussians to start from hold NaN or infinity; remove them first")
+    if not bool((gaussians.opacities > VISIBLE).any()):
+        raise InputError(
+            f"all Gaussians to start from are below an opacity of {VISIBLE:.4f}: no photograph would move them"
+        )
     return replace(gaussians, sh=gaussians.sh[:, : SH_COUNTS[settings.sh_degree]])
 
 

@@ -343,3 +343,22 @@ def test_numbers_that_are_not_whole(bad):
 def test_things_that_are_no_views(boards):
     with pytest.raises(InputError, match="views: expected posed photographs"):
         fit([view.camera for view in boards.views], settings=ONE_STEP)
+
+
+def test_masks_by_name(boards):
+    mask = np.zeros((48, 64), bool)
+    mask[:, :32] = True
+    fitted = fit(boards.views, load_points(boards.folder), settings=ONE_STEP, masks={"0000": mask})
+    same = fit(
+        boards.views,
+        load_points(boards.folder),
+        settings=ONE_STEP,
+        masks=lambda view: mask if view.stem == "0000" else None,
+    )
+    assert torch.equal(fitted.gaussians.means, same.gaussians.means)
+
+
+def test_a_transparent_start_is_refused(boards):
+    scene = fit(boards.views, load_points(boards.folder), settings=ONE_STEP).gaussians
+    with pytest.raises(InputError, match="no photograph would move them"):
+        fit(boards.views, replace(scene, opacities=torch.zeros(len(scene))), settings=ONE_STEP)
