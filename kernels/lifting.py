@@ -116,6 +116,20 @@ def sum_weights(
     weight_squared_out[i] += total * total
 
 
+@wp.func_native(
+    """
+#if !defined(__CUDA_ARCH__)
+    if (entry + 2 * ROWS_AHEAD < places.shape[0]) __builtin_prefetch(starts.data + places.data[entry + 2 * ROWS_AHEAD]);
+    if (entry + ROWS_AHEAD < places.shape[0])
+        __builtin_prefetch(weights.data + starts.data[places.data[entry + ROWS_AHEAD]]);
+#endif
+""".replace("ROWS_AHEAD", str(int(ROWS_AHEAD)))
+)
+def prefetch_weights(
+    weights: wp.array[float], starts: wp.array[int], places: wp.array[int], entry: int
+): ...  # a hint for the CPU's cache: first where the weights start, then they themselves
+
+
 @wp.kernel
 def sum_id_weights(
     # In:
@@ -142,6 +156,7 @@ def sum_id_weights(
     run = int(-1)  # neighbouring tiles mostly show the same id: its weight is written once
     run_weight = float(0.0)
     for e in range(entries[k], entries[k + 1]):
+        prefetch_weights(weights, starts, places, e)
         tile = tiles[e]
         start = starts[places[e]]
         for m in range(tile_id_counts[tile]):
