@@ -40,6 +40,7 @@ from sgwarp.kernels import (
     lifting,
     lifting_lanes,
     projection,
+    projection_lanes,
 )
 from sgwarp.kernels.gaussian import Pinhole, Splat
 from sgwarp.kernels.native import Seen
@@ -208,17 +209,17 @@ first_pose, second_pose = pose(-62), pose(38, elevation=30)
 # %% [markdown]
 # ## Project
 #
-# `project_gaussians` runs once per Gaussian: it builds $\Sigma = R S S^T R^T$ (eq. 3) and its image
-# $\Sigma' = J W \Sigma W^T J^T$ (eq. 2), and decides whether any pixel can see the result. `base`, the first argument
-# of every kernel that the CPU runs in chunks, is the first index of the launch; `sgwarp.ops` uses it to share a launch
-# among threads, here it is always 0. Outputs come last and end in `_out`.
+# `project_groups` takes 16 Gaussians at a time, one to a lane (on CUDA `project_gaussians` takes one): it builds
+# $\Sigma = R S S^T R^T$ (eq. 3) and its image $\Sigma' = J W \Sigma W^T J^T$ (eq. 2), and decides whether any pixel can
+# see the result. `base`, the first argument of every kernel that the CPU runs in chunks, is the first index of the
+# launch; `sgwarp.ops` uses it to share a launch among threads, here it is 0. Outputs come last and end in `_out`.
 
 
 # %%
 def project(camera):
     splats, status, depths = wp.zeros(N, dtype=Splat), wp.zeros(N, dtype=wp.uint8), wp.zeros(N, dtype=float)
     inputs = [0, means, rotations, deviations, opacity, camera, knobs]
-    wp.launch(projection.project_gaussians, N, inputs, [splats, status, depths])
+    wp.launch(projection_lanes.project_groups, -(-N // 16), inputs, [splats, status, depths])
     return splats, status, depths
 
 

@@ -133,7 +133,7 @@ for cap, point in quality.items():
 # %%
 encoder = sg.make_encoder("conse", views)
 semantics = sg.lift(scene, views, encoder)
-words = ["couch", "piano", "lamp"]
+words = ["couch", "plant", "lamp"]
 scores = sg.evidence(sg.query(semantics, words, encoder), semantics)
 print(f"{semantics.coverage:.1%} of the Gaussians were seen")
 

@@ -11,7 +11,6 @@ import tyro
 
 from sgwarp.commands.options import Options, check_name, find_views
 from sgwarp.errors import InputError
-from sgwarp.io.points import PLY_NAMES
 from sgwarp.progress import show_progress
 
 if TYPE_CHECKING:
@@ -90,6 +89,8 @@ class Fit(Options):
     """Of everything random; on the CPU the same seed gives the same scene, bit by bit."""
 
     def run(self) -> None:
+        from sgwarp.io.points import PLY_NAMES
+
         check_name("--out", self.out, ".ply")
         if self.out.name in PLY_NAMES and self.out.parent.resolve() == self.views.resolve():
             raise InputError(f"--out {self.out}: is a name of the points that a fit starts from; choose another")

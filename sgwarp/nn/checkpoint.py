@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import argparse
-import collections
 import os
 import pickle
 import re
@@ -54,7 +53,7 @@ def read_weights(path: str | os.PathLike[str]) -> dict[str, Tensor]:
 
 
 def _bystanders() -> list[Any]:
-    """Harmless types that training scripts store beside the weights: figures, counters, arguments."""
+    """Harmless types that training scripts store beside the weights: figures and arguments."""
     kinds = (np.float64, np.float32, np.int64, np.int32, np.bool_)
     core = np._core.multiarray  # type: ignore[attr-defined]
     functions = [
@@ -63,7 +62,7 @@ def _bystanders() -> list[Any]:
         for module in ("numpy._core", "numpy.core")
     ]
     dtypes = [type(np.dtype(kind)) for kind in kinds]
-    return [*functions, *dtypes, np.dtype, np.ndarray, argparse.Namespace, collections.defaultdict, int, float]
+    return [*functions, *dtypes, np.dtype, np.ndarray, argparse.Namespace]
 
 
 def without_prefixes(state: dict[str, Tensor]) -> dict[str, Tensor]:

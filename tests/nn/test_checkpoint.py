@@ -1,7 +1,6 @@
 """Checkpoints of MinkowskiEngine networks: prefixes, wrappers, and a clear word where they do not fit."""
 
 import argparse
-import collections
 import os
 import pickle
 
@@ -43,7 +42,7 @@ def test_what_training_scripts_store_beside_the_weights(net, tmp_path):
         "optimizer": {"state": {}, "param_groups": [{"lr": np.float32(1e-4)}]},
         "best_iou": np.float64(0.5),
         "args": argparse.Namespace(voxel=0.02),
-        "counts": collections.defaultdict(int, a=np.int64(1)),
+        "step": np.int64(1),
         "history": np.zeros(3),
     }
     torch.save(content, tmp_path / "net.pth")
