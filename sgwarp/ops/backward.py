@@ -21,7 +21,7 @@ from sgwarp.kernels.compositing_lanes_backward import MOMENTS, row_columns
 from sgwarp.kernels.lifting import sum_rows
 from sgwarp.kernels.transmittance import LaneIds, Lanes
 from sgwarp.ops import tiles
-from sgwarp.ops.launch import get_threads, launch, launch_blocks, scratch, view
+from sgwarp.ops.launch import fresh, get_threads, launch, launch_blocks, scratch, view
 from sgwarp.ops.lift import LiftSums, add_weighted
 from sgwarp.ops.rasterize import LANE, TILE_ROWS, in_slices, lane_scratch, runs_in_blocks
 from sgwarp.ops.settings import RasterSettings
@@ -258,7 +258,7 @@ def shade_backward(
         empty.
     """
     n, device = len(gaussians), gaussians.device
-    v_sh = torch.empty_like(gaussians.sh)
+    v_sh = fresh(*gaussians.sh.shape, device=device)
     v_offsets = torch.empty(n if pose else 0, 3, device=device)
     inputs = [
         view(gaussians.means, wp.vec3),
