@@ -168,19 +168,22 @@ def by_convolutions(image: torch.Tensor, truth: torch.Tensor) -> torch.Tensor:
 
 
 def draw(results: dict[str, dict], path: Path) -> None:
-    """Quality over seconds for both strategies, and over the number of Gaussians."""
+    """Quality and loss over seconds for both strategies, and quality over the number of Gaussians."""
     from matplotlib.figure import Figure
 
-    figure = Figure(figsize=(10, 4), dpi=150, layout="constrained", facecolor="white")
-    over_time, over_count = figure.subplots(1, 2)
+    figure = Figure(figsize=(13, 4), dpi=130, layout="constrained", facecolor="white")
+    over_time, loss, over_count = figure.subplots(1, 3)
     for name, colour in COLOURS.items():
         if name in results:
             curve = results[name]["curve"]
             over_time.plot([p["seconds"] for p in curve], [p["psnr"] for p in curve], color=colour, label=name)
+            loss.plot([p["seconds"] for p in curve], [p["loss"] for p in curve], color=colour, label=name)
             marks = results[name]["at"].values()
             over_time.plot([p["seconds"] for p in marks], [p["psnr"] for p in marks], "o", color=colour, markersize=4)
     over_time.set(xlabel="seconds of fitting", ylabel="held-out PSNR [dB]", title="Both strategies, cap 100,000")
     over_time.legend(frameon=False, loc="lower right")
+    loss.set(xlabel="seconds of fitting", ylabel="loss, running mean", title="0.8 L1 + 0.2 (1 - SSIM)", ylim=(0, None))
+    over_count.margins(0.14)
     sizes = [results[name] for name in (*(f"cap {cap}" for cap in CAPS), "mcmc") if name in results]
     over_count.plot([s["Gaussians"] for s in sizes], [s["held-out PSNR"] for s in sizes], "o-", color=COLOURS["mcmc"])
     for size in sizes:
@@ -188,7 +191,7 @@ def draw(results: dict[str, dict], path: Path) -> None:
         place = (size["Gaussians"], size["held-out PSNR"])
         over_count.annotate(label, place, xytext=(4, -12), textcoords="offset points")
     over_count.set(xlabel="Gaussians", ylabel="held-out PSNR [dB]", title="mcmc, 10,000 steps", xscale="log")
-    for axis in (over_time, over_count):
+    for axis in (over_time, loss, over_count):
         axis.grid(alpha=0.3)
         axis.spines[["top", "right"]].set_visible(False)
     with atomic_path(path) as temporary:
