@@ -51,9 +51,9 @@ def test_shipped_data(room):
 def test_true_labels_bound_what_an_encoder_can_reach(room):
     """The projection alone, with nothing of the held-out views in the scene."""
     result = measure(room, lift(room.gaussians, room.views, room.label_map))
-    assert result.miou > 0.8
+    assert result.miou > 0.9
     assert result.localised == FURNITURE
-    assert result.coverage > 0.95
+    assert result.coverage > 0.9  # a fit leaves some Gaussians where no view sees them
     sizes = {(f.name, f.stem): int((room.truth[f.stem] == room.names.index(f.name)).sum()) for f in result.findings}
     for finding in result.best_sights:
         assert sizes[finding.name, finding.stem] == max(n for (name, _), n in sizes.items() if name == finding.name)
