@@ -12,7 +12,7 @@ import pytest
 import sgwarp
 
 HEAVY = ("torch", "warp", "cv2", "matplotlib", "transformers", "safetensors", "plyfile", "scipy")
-COMMANDS = ("lift", "query", "segment", "render", "info", "encoders", "demo")
+COMMANDS = ("lift", "query", "segment", "render", "info", "encoders", "demo", "fit", "distill", "predict", "report")
 
 
 def heavy_modules_after(code: str) -> list[str]:

@@ -8,7 +8,7 @@ from collections.abc import Mapping
 import torch
 from torch import Tensor
 
-from sgwarp.ops.adam import Group, Taken, update
+from sgwarp.ops.adam import BETAS, Group, Taken, update
 
 RATE, LAST_RATE = 0.01, 0.001  # of the reference implementation
 
@@ -40,7 +40,9 @@ class Exposure:
         marks[index] = 1
         self.steps[index] += 1
         none, count = torch.zeros_like(self.steps), self.steps.float()
-        factors = torch.stack([1 / (1 - 0.9**count), 1 / (1 - 0.999**count), count * 0 + 1, count * 0 + 1], dim=1)
+        unchanged = torch.ones_like(count)  # no photograph makes up for steps of others
+        by_first, by_second = (1 / (1 - beta**count) for beta in BETAS)
+        factors = torch.stack([by_first, by_second, unchanged, unchanged], dim=1)
         taken = Taken(marks, self.steps, none, count.new_zeros(len(count), 2), factors)
         gradients = torch.zeros_like(self.group.parameters)
         gradients[index] = gradient

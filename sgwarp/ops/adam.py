@@ -14,6 +14,7 @@ from sgwarp.kernels.transmittance import Lanes
 from sgwarp.ops.launch import launch, view
 
 LANE = 16
+BETAS = (float(kernels.BETA_1), float(kernels.BETA_2))
 FORMS = {"plain": kernels.PLAIN, "logarithm": kernels.LOGARITHM, "logit": kernels.LOGIT}
 
 

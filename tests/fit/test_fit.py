@@ -144,7 +144,7 @@ def test_sparse_updates_cost_no_quality(fitted, boards):
     log = RunLog()
     dense = short_fit(boards, replace(settings, sparse=False), log=log)
     assert "updates_of_unseen_gaussians" not in log.left_out
-    assert abs(dense.held_out["0000"] - result.held_out["0000"]) < 1.0
+    assert abs(dense.held_out["0000"] - result.held_out["0000"]) < 0.5  # the sets they grow to differ
 
 
 def test_what_is_reported(boards):
