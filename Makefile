@@ -6,7 +6,7 @@
 VENV := .venv
 BIN := $(VENV)/bin
 ARGS ?=
-SOURCES := $(wildcard sgwarp kernels tests notebooks benchmarks)
+SOURCES := $(wildcard sgwarp kernels tests notebooks benchmarks tools)
 
 # A name on PATH may be an empty shim, so each candidate has to run.
 PYTHON ?= $(shell for name in python3 python python3.14 python3.13 python3.12 python3.11 python3.10; do \

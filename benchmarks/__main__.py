@@ -31,7 +31,7 @@ import limit_training
 import memory
 import training
 
-from sgwarp.ops import launch
+from sgwarp.ops import launcher
 
 SECTIONS = ("forward", "training", "lifting", "growth", "memory", "cold")
 CHECKED = {"forward", "training", "lifting", "growth"}  # use the limits
@@ -49,7 +49,7 @@ def main() -> None:
     unknown = set(chosen) - set(SECTIONS)
     if unknown:
         parser.error(f"--only: unknown section {', '.join(sorted(unknown))}; there are {', '.join(SECTIONS)}")
-    cores = launch.get_threads()
+    cores = launcher.get_threads()
     results = json.loads(options.out.read_text()) if options.out.exists() else {}
     results |= {"machine": platform.processor() or platform.machine(), "cores": cores}
     if CHECKED & set(chosen):

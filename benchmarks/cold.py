@@ -17,7 +17,7 @@ def first_call(kind: str) -> float:
     import scenes
     from training import step
 
-    from sgwarp.ops.rasterize import rasterize
+    from sgwarp.ops.splatting.forward import rasterize
 
     gaussians, camera, _ = scenes.room(10_000)
     gaussians = scenes.with_harmonics(gaussians)

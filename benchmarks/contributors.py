@@ -11,9 +11,9 @@ from collections.abc import Callable
 
 import scenes
 
-from sgwarp.ops import launch
-from sgwarp.ops.contributors import top_contributors
-from sgwarp.ops.rasterize import rasterize
+from sgwarp.ops import launcher
+from sgwarp.ops.splatting.contributors import top_contributors
+from sgwarp.ops.splatting.forward import rasterize
 
 PLACES = (1, 4, 8, 16, 32)
 
@@ -21,7 +21,7 @@ PLACES = (1, 4, 8, 16, 32)
 def contributors(count: int, cores: int, rounds: int) -> dict[str, float]:
     """Smallest wall time [ms] of rendering a view and of ranking its contributors, all taking turns."""
     gaussians, camera, _ = scenes.room(count)
-    launch.set_threads(cores)
+    launcher.set_threads(cores)
     jobs: dict[str, Callable[[], object]] = {"render": lambda: rasterize(gaussians, camera)}
     jobs |= {f"top {k}": lambda k=k: top_contributors(gaussians, camera, k) for k in PLACES}
     times = dict.fromkeys(jobs, float("inf"))
@@ -38,7 +38,7 @@ def main() -> None:
     parser.add_argument("--count", type=int, default=100_000)
     parser.add_argument("--rounds", type=int, default=12)
     options = parser.parse_args()
-    cores = launch.get_threads()
+    cores = launcher.get_threads()
     times = contributors(options.count, cores, options.rounds)
     print(f"{options.count} Gaussians, 640x480, {cores} thread{'s' * (cores > 1)}, render {times['render']:.1f} ms")
     for k in PLACES:

@@ -21,18 +21,19 @@ import torch
 from torch import Tensor
 
 from sgwarp.datasets.synthetic import CLASSES, Room, make_room, room_cameras
-from sgwarp.distill.data import TrainingScene
-from sgwarp.distill.settings import DistillSettings
-from sgwarp.distill.train import distill
-from sgwarp.ensemble import projection_quality, seen_by
-from sgwarp.evaluate.segmentation import ConfusionMatrix
-from sgwarp.lift import lift
-from sgwarp.nn.augment import Augmentation
-from sgwarp.nn.inputs import InputMode
-from sgwarp.predict import predict
-from sgwarp.query import class_votes
-from sgwarp.render import render
-from sgwarp.runlog import RunLog
+from sgwarp.lifting.lifter import lift
+from sgwarp.metrics.segmentation import ConfusionMatrix
+from sgwarp.network.augmentation import Augmentation
+from sgwarp.network.inputs import InputMode
+from sgwarp.network.prediction import predict
+from sgwarp.network.quality import projection_quality
+from sgwarp.network.training.data import TrainingScene
+from sgwarp.network.training.settings import DistillSettings
+from sgwarp.network.training.trainer import distill
+from sgwarp.querying.ensembles import seen_by
+from sgwarp.querying.scores import class_votes
+from sgwarp.rendering.renderer import render
+from sgwarp.runs.log import RunLog
 from sgwarp.scene import FeatureMap, Semantics, View
 
 CHANNELS = 32

@@ -29,9 +29,9 @@ sys.path.insert(0, str(Path(__file__).parent))
 
 import sgwarp as sg
 from sgwarp.demo.data import FURNITURE
-from sgwarp.demo.measure import measure
+from sgwarp.demo.measurement import measure
 from sgwarp.encoders.cache import CachedMaps, pack
-from sgwarp.ops.lift import LiftSums, lift_view
+from sgwarp.ops.splatting.lifting import LiftSums, lift_view
 from sgwarp.scene import Camera, FeatureMap, Gaussians, View
 
 COUNT = 200_000  # Gaussians of the room

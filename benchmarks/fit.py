@@ -24,15 +24,15 @@ import torch
 
 import sgwarp as sg
 from benchmarks.room import FullRoom, label_iou
-from sgwarp.demo.build import SETTINGS as DEMO
-from sgwarp.fit import Fitted
-from sgwarp.fitting.photographs import read_photographs
-from sgwarp.fitting.report import write_contact_sheet
-from sgwarp.fitting.settings import FitSettings
-from sgwarp.io.atomic import atomic_path
-from sgwarp.ops.launch import get_threads
+from sgwarp.files.atomic import atomic_path
+from sgwarp.ops.launcher import get_threads
 from sgwarp.ops.photometric import photometric_loss
-from sgwarp.runlog import RunLog
+from sgwarp.reconstruction.fitting.photographs import read_photographs
+from sgwarp.reconstruction.fitting.report import write_contact_sheet
+from sgwarp.reconstruction.fitting.settings import FitSettings
+from sgwarp.reconstruction.fitting.trainer import Fitted
+from sgwarp.runs.log import RunLog
+from tools.build_demo_room import SETTINGS as DEMO
 
 HOLD_OUT = 8
 STEPS = 10_000

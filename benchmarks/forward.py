@@ -9,10 +9,10 @@ import torch
 from limit_training import TrainingLimit
 from timing import Run, fastest, plural, report, shares, stage_times
 
-from sgwarp.ops import tiles
-from sgwarp.ops.plan import plan_render
-from sgwarp.ops.rasterize import composite, packed_colors, rasterize
-from sgwarp.ops.settings import RasterSettings
+from sgwarp.ops.splatting import tiles
+from sgwarp.ops.splatting.forward import composite, packed_colors, rasterize
+from sgwarp.ops.splatting.plan import plan_render
+from sgwarp.ops.splatting.settings import RasterSettings
 
 SETTINGS = RasterSettings()
 MOST_OF_A_STAGE = 0.25  # bound on every stage but compositing

@@ -10,7 +10,7 @@ from limit_training import TrainingLimit
 from timing import Run, exponent, fastest, plural, report, stage_times
 from training import image_gradients, limit_step, step
 
-from sgwarp.ops.rasterize import rasterize
+from sgwarp.ops.splatting.forward import rasterize
 
 COUNTS = (10_000, 30_000, 100_000, 300_000, 1_000_000)
 

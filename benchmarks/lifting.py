@@ -8,8 +8,8 @@ import scenes
 import torch
 from timing import Run, fastest, plural, report
 
-from sgwarp.ops.lift import LiftSums, lift_view
-from sgwarp.ops.rasterize import rasterize
+from sgwarp.ops.splatting.forward import rasterize
+from sgwarp.ops.splatting.lifting import LiftSums, lift_view
 from sgwarp.scene import FeatureMap
 
 DENSE = (16, 64, 512)

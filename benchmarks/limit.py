@@ -180,8 +180,8 @@ def self_check(threads: int = 2) -> dict[str, float]:
     import torch
     from scenes import LABELS, projected, room
 
-    from sgwarp.ops.reference import rasterize
-    from sgwarp.ops.reference_lift import lift_weighted
+    from sgwarp.ops.reference.lifting import lift_weighted
+    from sgwarp.ops.reference.rasterizer import rasterize
 
     gaussians, camera, _ = room(3000, seed=1)
     camera = camera.resized(101, 150)

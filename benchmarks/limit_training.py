@@ -16,7 +16,7 @@ import torch
 from limit import library, pointer
 from torch import Tensor
 
-from sgwarp.ops import reference
+from sgwarp.ops.reference import rasterizer as reference
 from sgwarp.scene import Camera, Gaussians
 
 STAGES = (

@@ -32,9 +32,9 @@ def probe(count: int, width: int, height: int) -> dict[str, int]:
     import scenes
     from training import step
 
-    from sgwarp.ops import tiles
-    from sgwarp.ops.launch import release_scratch
-    from sgwarp.ops.settings import RasterSettings
+    from sgwarp.ops.launcher import release_scratch
+    from sgwarp.ops.splatting import tiles
+    from sgwarp.ops.splatting.settings import RasterSettings
 
     tiny, camera, _ = scenes.room(100)
     step(scenes.with_harmonics(tiny), camera.resized(32, 32), None)()

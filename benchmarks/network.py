@@ -21,15 +21,15 @@ from pathlib import Path
 import torch
 
 from sgwarp.datasets.synthetic import make_room, room_cameras
-from sgwarp.lift import lift
-from sgwarp.network import SemanticNetwork
-from sgwarp.nn.inputs import voxelize
-from sgwarp.nn.mink_unet import MinkUNet
-from sgwarp.nn.sparse import Grid, SparseTensor
-from sgwarp.ops.sparse_conv import sparse_conv
-from sgwarp.ops.voxels import kernel_map, unpack_voxels
-from sgwarp.predict import predict
-from sgwarp.render import render
+from sgwarp.lifting.lifter import lift
+from sgwarp.network.inputs import voxelize
+from sgwarp.network.layers.mink_unet import MinkUNet
+from sgwarp.network.layers.sparse import Grid, SparseTensor
+from sgwarp.network.prediction import predict
+from sgwarp.network.semantic_network import SemanticNetwork
+from sgwarp.ops.sparse.convolution import sparse_conv
+from sgwarp.ops.sparse.voxels import kernel_map, unpack_voxels
+from sgwarp.rendering.renderer import render
 from sgwarp.scene import FeatureMap, View
 
 Job = Callable[[], object]

@@ -19,11 +19,11 @@ import torch
 from torch import Tensor
 
 import sgwarp as sg
-from sgwarp.ops import launch
-from sgwarp.ops import rasterize as forward
-from sgwarp.ops.differentiable import rasterize
-from sgwarp.ops.lift import LiftSums, lift_view
-from sgwarp.ops.plan import RenderPlan, plan_render
+from sgwarp.ops import launcher
+from sgwarp.ops.splatting import forward
+from sgwarp.ops.splatting.autograd import rasterize
+from sgwarp.ops.splatting.lifting import LiftSums, lift_view
+from sgwarp.ops.splatting.plan import RenderPlan, plan_render
 from sgwarp.scene import Camera, FeatureMap, Gaussians
 
 sys.path.insert(0, str(Path(__file__).parent))
@@ -117,7 +117,7 @@ def main() -> None:
         for name, (everything, needed) in omissions(gaussians, camera).items():
             whole, part = everything(), needed()
             difference = float((whole - part).abs().max()) / max(float(whole.abs().max()), 1e-30)
-            threads = launch.get_threads()
+            threads = launcher.get_threads()
             times = fastest({"everything": Run(everything, threads), "needed": Run(needed, threads)}, ROUNDS)
             results[scene][name] = {**times, "relative difference": difference}
             line = f"{times['everything']:8.2f} -> {times['needed']:7.2f} ms, difference {difference:.1e}"

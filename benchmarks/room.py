@@ -1,6 +1,6 @@
 """The whole path on the full room: segmentation and localisation on held-out views, error beside run time.
 
-    SGWARP_DATA=FOLDER python benchmarks/room.py [--count 200000] [--out benchmarks/room.json]
+    SGWARP_DATA=FOLDER python -m benchmarks.room [--count 200000] [--out benchmarks/room.json]
 
 The folder holds room/: 60 posed views with depth and label images; every eighth is held out. Gaussians are made from
 the RGB-D of the others. Lifting their true labels measures the projection alone (`weighted` and the paper's `center`);
@@ -21,16 +21,16 @@ import torch
 from torch import Tensor
 
 import sgwarp as sg
-from sgwarp.demo.build import SHOWN
 from sgwarp.demo.data import FURNITURE, Room
-from sgwarp.demo.measure import Measurement, measure
+from sgwarp.demo.measurement import Measurement, measure
 from sgwarp.demo.sheets import draw_queries, draw_segmentation
-from sgwarp.evaluate.segmentation import ConfusionMatrix
-from sgwarp.from_depth import gaussians_from_depth
-from sgwarp.io.images import read_ids
-from sgwarp.query import class_votes
+from sgwarp.files.images import read_ids
+from sgwarp.metrics.segmentation import ConfusionMatrix
+from sgwarp.querying.scores import class_votes
+from sgwarp.querying.segmentation import segment_votes
+from sgwarp.reconstruction.depth import gaussians_from_depth
 from sgwarp.scene import FeatureMap, View
-from sgwarp.segment import segment_votes
+from tools.build_demo_room import SHOWN
 
 HOLD_OUT = 8
 

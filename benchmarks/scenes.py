@@ -8,7 +8,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 import torch
 
-from sgwarp.ops.reference import ReferenceSettings, project_scene, spherical_harmonics
+from sgwarp.ops.reference.rasterizer import ReferenceSettings, project_scene, spherical_harmonics
 from sgwarp.scene import Camera, Gaussians
 
 TILE = 16  # side of a tile [pixels]

@@ -13,7 +13,10 @@ from typing import Any
 import numpy as np
 import torch
 
-from sgwarp.ops import backward, differentiable, launch, rasterize, tiles
+from sgwarp.ops import launcher
+from sgwarp.ops.splatting import autograd as differentiable
+from sgwarp.ops.splatting import backward, tiles
+from sgwarp.ops.splatting import forward as rasterize
 
 Job = Callable[[], object]
 
@@ -41,7 +44,7 @@ class Run:
 
 
 def set_threads(count: int) -> None:
-    launch.set_threads(count)
+    launcher.set_threads(count)
     torch.set_num_threads(count)
 
 
@@ -50,7 +53,7 @@ def fastest(runs: dict[str, Run], rounds: int) -> dict[str, float]:
     best = dict.fromkeys(runs, float("inf"))
     for _ in range(rounds + 1):  # the first round compiles and warms up; its times are beaten
         for name, run in runs.items():
-            if run.threads != launch.get_threads():
+            if run.threads != launcher.get_threads():
                 set_threads(run.threads)
                 run.job()  # starts the threads
             start = time.perf_counter()

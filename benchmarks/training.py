@@ -11,7 +11,7 @@ from limit_training import TrainingLimit
 from timing import Run, fastest, plural, report, shares, stage_times
 from torch import Tensor
 
-from sgwarp.ops.differentiable import rasterize
+from sgwarp.ops.splatting.autograd import rasterize
 from sgwarp.scene import Camera, Gaussians
 
 GEOMETRY = ("means", "quats", "scales", "opacities")

@@ -16,7 +16,7 @@ an entry an intersection (one splat in one tile) counted splat by splat.
 import warp as wp
 
 from sgwarp.kernels.gaussian import EXACT_OPTIONS, Splat, column_range
-from sgwarp.kernels.projection import VISIBLE
+from sgwarp.kernels.projection.forward import VISIBLE
 
 wp.set_module_options(EXACT_OPTIONS)
 

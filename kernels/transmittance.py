@@ -2,7 +2,7 @@
 
 import warp as wp
 
-from sgwarp.kernels.projection import Knobs
+from sgwarp.kernels.projection.forward import Knobs
 
 # One vector register of the lane schedule holds 16 pixels of a row (AVX-512; narrower machines use two or four).
 LANES = 16

@@ -31,21 +31,22 @@ from matplotlib.collections import EllipseCollection
 from matplotlib.patches import Rectangle
 
 import sgwarp as sg
-from sgwarp.kernels import (
-    binning,
-    compositing_block,
-    compositing_lanes,
-    compositing_lanes_features,
-    harmonics,
-    lifting,
-    lifting_lanes,
-    projection,
-    projection_lanes,
-)
+from sgwarp.kernels import binning
+from sgwarp.kernels.compositing import block as compositing_block
+from sgwarp.kernels.compositing import lanes as compositing_lanes
+from sgwarp.kernels.compositing import lanes_features as compositing_lanes_features
 from sgwarp.kernels.gaussian import Pinhole, Splat
+from sgwarp.kernels.harmonics import forward as harmonics
+from sgwarp.kernels.lifting import lanes as lifting_lanes
+from sgwarp.kernels.lifting import shared as lifting
 from sgwarp.kernels.native import Seen
+from sgwarp.kernels.projection import forward as projection
+from sgwarp.kernels.projection import lanes as projection_lanes
 from sgwarp.kernels.transmittance import LaneIds, Lanes
-from sgwarp.ops.lift import LiftSums, lift_view  # only to compare with; importing it starts Warp without its banner
+from sgwarp.ops.splatting.lifting import (  # only to compare with; importing it starts Warp without its banner
+    LiftSums,
+    lift_view,
+)
 
 wp.set_device("cpu")
 plt.rcParams.update({"figure.dpi": 110, "figure.constrained_layout.use": True, "font.size": 9, "axes.titlesize": 10})
@@ -713,10 +714,9 @@ plt.show()
 
 # %% [markdown]
 # ### Two checks
-#
 # That lifting is the transpose of rendering takes one number to see:
-# $\langle A x, y \rangle = \langle x, A^T y \rangle$ for random $x$ and $y$. And `sgwarp.ops.lift` launches the same
-# kernels, so it gives the same sums.
+# $\langle A x, y \rangle = \langle x, A^T y \rangle$ for random $x$ and $y$.
+# `sgwarp.ops.splatting.lifting` launches the same kernels, so it gives the same sums.
 
 # %%
 x, y = rng.normal(size=(N, CHANNELS)), rng.normal(size=(HEIGHT, WIDTH, CHANNELS))

@@ -1,17 +1,20 @@
 """Fixtures shared by all tests: the catalogue of scenes, and central differences.
 
-`scene` runs a test once per named scene; `make_scene("name")` builds one; both are in tests/scenes.py. That file, like
-tests/differences.py, is loaded by its path, because importlib mode puts no folder of tests on sys.path.
+`scene` runs a test once per named scene; `make_scene("name")` builds one; both are in tests/scenes.py. `stage` is a
+small labeled scene with views, `stage_files` the same as files (tests/stage.py). These files, like
+tests/differences.py, are loaded by their paths, because importlib mode puts no folder of tests on sys.path.
 """
 
 import importlib.util
 import sys
 from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import NamedTuple
 
 import pytest
 
+from sgwarp.errors import InputError
 from sgwarp.scene import Camera, Gaussians
 
 
@@ -25,6 +28,8 @@ def _load(name: str, path: Path):
 
 catalogue = _load("sgwarp_test_scenes", Path(__file__).with_name("scenes.py"))
 differences = _load("sgwarp_test_differences", Path(__file__).with_name("differences.py"))
+_stage = _load("sgwarp_test_stage", Path(__file__).with_name("stage.py"))
+stage, toy_text, stage_files = _stage.stage, _stage.toy_text, _stage.stage_files
 
 
 class NamedScene(NamedTuple):
@@ -55,6 +60,21 @@ def scenes():
 def assert_central_differences():
     """Compare gradients with central differences of a float64 loss."""
     return differences.assert_central_differences
+
+
+@contextmanager
+def _allow_input_error(path: Path) -> Iterator[None]:
+    try:
+        yield
+    except InputError as error:
+        if not str(error).startswith(str(path)) or "\n" in str(error):
+            pytest.fail(f"not one line that begins with {path}: {error}")
+
+
+@pytest.fixture(scope="session")
+def allow_input_error():
+    """Context manager for random input: either the block passes or an InputError names the file on one line."""
+    return _allow_input_error
 
 
 @pytest.fixture(scope="session", autouse=True)

@@ -10,8 +10,8 @@ import nbformat
 import pytest
 import warp as wp
 
-from sgwarp.io.images import read_ids
-from sgwarp.ops import launch  # noqa: F401 - starts Warp quietly
+from sgwarp.files.images import read_ids
+from sgwarp.ops import launcher  # noqa: F401 - starts Warp quietly
 
 FOLDER = Path(__file__).resolve().parents[1] / "notebooks"
 NOTEBOOKS = sorted(FOLDER.glob("*.py"))

@@ -10,14 +10,14 @@ import tyro
 
 from sgwarp.commands.options import Options, check_name, require_no_lift
 from sgwarp.errors import InputError
-from sgwarp.progress import show_progress
+from sgwarp.runs.progress import show_progress
 
 if TYPE_CHECKING:
     from torch import Tensor
 
-    from sgwarp.distill.data import TrainingScene
-    from sgwarp.distill.settings import DistillSettings
-    from sgwarp.runlog import RunLog
+    from sgwarp.network.training.data import TrainingScene
+    from sgwarp.network.training.settings import DistillSettings
+    from sgwarp.runs.log import RunLog
 
 
 @dataclass(kw_only=True)
@@ -80,14 +80,14 @@ class Distill(Options):
     def run(self) -> None:
         check_name("--out", self.out, ".safetensors")
         require_no_lift(self.out)
-        from sgwarp.distill.processes import joined
+        from sgwarp.network.training.processes import joined
 
         log = self.start()
         with joined(self.device) as processes:
-            from sgwarp.distill.curves import write_curves
-            from sgwarp.distill.data import scenes_in
-            from sgwarp.distill.train import distill, state_path
-            from sgwarp.network import save_network
+            from sgwarp.network.semantic_network import save_network
+            from sgwarp.network.training.curves import write_curves
+            from sgwarp.network.training.data import scenes_in
+            from sgwarp.network.training.trainer import distill, state_path
 
             scenes, validation = scenes_in(self.scenes), scenes_in(self.validation or [])
             settings = self._settings()
@@ -116,8 +116,8 @@ class Distill(Options):
             print(log.summary())
 
     def _settings(self) -> DistillSettings:
-        from sgwarp.distill.settings import DistillSettings
-        from sgwarp.nn.augment import Augmentation
+        from sgwarp.network.augmentation import Augmentation
+        from sgwarp.network.training.settings import DistillSettings
 
         return DistillSettings(
             arch=self.arch,

@@ -11,13 +11,13 @@ import tyro
 
 from sgwarp.commands.options import Options, check_name, find_views
 from sgwarp.errors import InputError
-from sgwarp.progress import show_progress
+from sgwarp.runs.progress import show_progress
 
 if TYPE_CHECKING:
-    from sgwarp.fit import Fitted
-    from sgwarp.fitting.photographs import Masks
-    from sgwarp.fitting.settings import FitSettings
-    from sgwarp.runlog import RunLog
+    from sgwarp.reconstruction.fitting.photographs import Masks
+    from sgwarp.reconstruction.fitting.settings import FitSettings
+    from sgwarp.reconstruction.fitting.trainer import Fitted
+    from sgwarp.runs.log import RunLog
     from sgwarp.scene import View
 
 DEGREE_EVERY = 1000  # steps between two rises of the degree of the colours
@@ -97,9 +97,9 @@ class Fit(Options):
         if self.hold_out < 0:
             raise InputError(f"--hold-out: expected 0 or more, got {self.hold_out}")
         with self.logged(self.out.parent) as log:
-            from sgwarp.fit import fit
-            from sgwarp.fitting.photographs import masks_from_folder, require_enough
-            from sgwarp.fitting.settings import FitSettings
+            from sgwarp.reconstruction.fitting.photographs import masks_from_folder, require_enough
+            from sgwarp.reconstruction.fitting.settings import FitSettings
+            from sgwarp.reconstruction.fitting.trainer import fit
 
             views = find_views(self.views)
             held_out = views[:: self.hold_out] if self.hold_out else []
@@ -157,16 +157,16 @@ class Fit(Options):
         with log.stage("start"):
             if init == "points":
                 return load_points(self.points or self.views)
-            from sgwarp.fitting.initial import depth_from_folder
-            from sgwarp.from_depth import gaussians_from_depth
+            from sgwarp.reconstruction.depth import gaussians_from_depth
+            from sgwarp.reconstruction.fitting.initial import depth_from_folder
 
             assert self.depth is not None
             return gaussians_from_depth(views, depth_from_folder(self.depth), count=settings.cap)
 
     def _write(self, fitted: Fitted, held_out: list[View], masks: Masks | None, log: RunLog) -> None:
-        from sgwarp.fitting.photographs import read_photographs
-        from sgwarp.fitting.report import draw_curve, write_contact_sheet
         from sgwarp.io.scenes import save_gaussians
+        from sgwarp.reconstruction.fitting.photographs import read_photographs
+        from sgwarp.reconstruction.fitting.report import draw_curve, write_contact_sheet
 
         last = fitted.curve[-1]
         with log.stage("write"):
@@ -188,7 +188,7 @@ class Fit(Options):
 
 
 def _has_matplotlib() -> bool:
-    from sgwarp.fitting.report import require_matplotlib
+    from sgwarp.reconstruction.fitting.report import require_matplotlib
 
     try:
         require_matplotlib()

@@ -7,10 +7,10 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
 from sgwarp.commands.options import SceneOptions, check_name, find_views
-from sgwarp.progress import show_progress
+from sgwarp.runs.progress import show_progress
 
 if TYPE_CHECKING:
-    from sgwarp.runlog import RunLog
+    from sgwarp.runs.log import RunLog
     from sgwarp.scene import Gaussians, Semantics, View
 
 
@@ -77,7 +77,7 @@ class Lift(SceneOptions):
     def _lift(self, gaussians: Gaussians, views: list[View], log: RunLog) -> Semantics:
         from sgwarp.encoders.cache import CachedMaps, default_folder
         from sgwarp.encoders.registry import make_encoder
-        from sgwarp.lift import lift
+        from sgwarp.lifting.lifter import lift
 
         folder = None if self.cache == "none" else self.cache or default_folder()
         with log.stage("load_encoder"):

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Literal
 import tyro
 
 from sgwarp.errors import InputError
-from sgwarp.runlog import RunLog
+from sgwarp.runs.log import RunLog
 
 if TYPE_CHECKING:
     from torch import Tensor
@@ -47,7 +47,7 @@ class Options:
         """
         import torch
 
-        from sgwarp.ops.launch import MAX_THREADS, get_threads, set_threads
+        from sgwarp.ops.launcher import MAX_THREADS, get_threads, set_threads
 
         if self.threads is not None:
             if not 1 <= self.threads <= MAX_THREADS:
@@ -173,7 +173,7 @@ def photograph(gaussians: Gaussians, view: View) -> Tensor:
     """The view's photograph, or without one its rendering, float32 [H, W, 3] on the CPU."""
     if view.image_path is not None:
         return view.image()
-    from sgwarp.render import render
+    from sgwarp.rendering.renderer import render
 
     return render(gaussians, view.camera).clamp(0.0, 1.0).cpu()
 

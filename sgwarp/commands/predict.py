@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Literal
 from sgwarp.commands.options import SceneOptions, check_name, load_on, require_no_lift
 
 if TYPE_CHECKING:
-    from sgwarp.runlog import RunLog
+    from sgwarp.runs.log import RunLog
     from sgwarp.scene import Gaussians, Semantics
 
 
@@ -55,9 +55,9 @@ class Predict(SceneOptions):
             log.outputs.append(str(self.out))
 
     def _semantics(self, gaussians: Gaussians, log: RunLog) -> Semantics:
-        from sgwarp.ensemble import filled, projection_quality
-        from sgwarp.network import load_network
-        from sgwarp.predict import predict
+        from sgwarp.network.prediction import predict
+        from sgwarp.network.quality import filled, projection_quality
+        from sgwarp.network.semantic_network import load_network
 
         projected = None
         if self.projection is not None:

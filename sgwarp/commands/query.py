@@ -13,7 +13,7 @@ from sgwarp.errors import InputError
 if TYPE_CHECKING:
     from torch import Tensor
 
-    from sgwarp.runlog import RunLog
+    from sgwarp.runs.log import RunLog
     from sgwarp.scene import Semantics
 
 
@@ -54,10 +54,10 @@ class Query(SemanticsOptions):
         if self.box < 1:
             raise InputError(f"--box: expected a side of 1 pixel or more, got {self.box}")
         with self.logged(self.out.parent) as log:
-            from sgwarp.ensemble import seen_by
-            from sgwarp.io.images import write_ids, write_rgb
-            from sgwarp.pictures import heat_map, mark_pixel
-            from sgwarp.segment import localize
+            from sgwarp.files.images import write_ids, write_rgb
+            from sgwarp.querying.ensembles import seen_by
+            from sgwarp.querying.segmentation import localize
+            from sgwarp.visualization.pictures import heat_map, mark_pixel
 
             gaussians, semantics = self.load_both(log)
             predicted = self.load_predicted(gaussians, log)
@@ -77,8 +77,9 @@ class Query(SemanticsOptions):
 
     def _scores(self, semantics: Semantics, predicted: Semantics | None, log: RunLog) -> Tensor:
         """Score of every Gaussian on the scale of the mask, [N]."""
-        from sgwarp.ensemble import combine, require_together, seen_by
-        from sgwarp.query import class_votes, evidence, query, relevancy, rescale
+        from sgwarp.querying.ensembles import combine, seen_by
+        from sgwarp.querying.scores import class_votes, evidence, query, relevancy, rescale
+        from sgwarp.scene.semantics import require_together
 
         if semantics.labels is not None:
             return class_votes(semantics, [self.text], predicted=predicted, ensemble=self.ensemble)[:, 0]

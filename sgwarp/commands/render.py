@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Literal
 
 from sgwarp.commands.options import SceneOptions, check_folder, find_views
 from sgwarp.errors import InputError
-from sgwarp.progress import show_progress
+from sgwarp.runs.progress import show_progress
 
 if TYPE_CHECKING:
     from torch import Tensor
@@ -51,7 +51,7 @@ class Render(SceneOptions):
         if self.view is not None and self.views is None:
             raise InputError(f"--view {self.view}: needs --views, the folder that holds it")
         with self.logged(folder) as log:
-            from sgwarp.render import render
+            from sgwarp.rendering.renderer import render
 
             gaussians = self.load_scene(log)
             views = self._views(gaussians)
@@ -70,7 +70,7 @@ class Render(SceneOptions):
 
     def _views(self, gaussians: Gaussians) -> list[View]:
         if self.views is None:
-            from sgwarp.orbit import orbit_views
+            from sgwarp.rendering.orbits import orbit_views
 
             return orbit_views(gaussians, self.frames, *self.size, up=self.up)
         try:
@@ -83,9 +83,9 @@ class Render(SceneOptions):
         """The picture, and for depth the numbers; returns their paths."""
         import numpy as np
 
-        from sgwarp.io.atomic import atomic_path
-        from sgwarp.io.images import write_rgb
-        from sgwarp.pictures import depth_picture
+        from sgwarp.files.atomic import atomic_path
+        from sgwarp.files.images import write_rgb
+        from sgwarp.visualization.pictures import depth_picture
 
         if self.mode in ("rgb", "alpha"):
             write_rgb(path, image if self.mode == "rgb" else image[..., None].expand(-1, -1, 3))

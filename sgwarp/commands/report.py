@@ -39,8 +39,8 @@ class Report(SceneOptions):
     def run(self) -> None:
         check_folder("--out", self.out)
         with self.logged(self.out) as log:
-            from sgwarp.report.extremes import EXTREMES
-            from sgwarp.report.run import make_report
+            from sgwarp.evaluation.report.extremes import EXTREMES
+            from sgwarp.evaluation.report.run import make_report
 
             gaussians = self.load_scene(log)
             make_report(

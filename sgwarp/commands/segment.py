@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Literal
 
 from sgwarp.commands.options import SemanticsOptions, check_folder, find_views, photograph
 from sgwarp.errors import InputError
-from sgwarp.progress import show_progress
+from sgwarp.runs.progress import show_progress
 
 if TYPE_CHECKING:
     from torch import Tensor
@@ -48,9 +48,9 @@ class Segment(SemanticsOptions):
             raise InputError(f"--unknown-below: expected a confidence from 0 to 1, got {self.unknown_below}")
         classes = None if self.classes is None else class_names(self.classes)
         with self.logged(self.out) as log:
-            from sgwarp.ensemble import seen_by
-            from sgwarp.query import class_votes
-            from sgwarp.segment import segment_votes
+            from sgwarp.querying.ensembles import seen_by
+            from sgwarp.querying.scores import class_votes
+            from sgwarp.querying.segmentation import segment_votes
 
             gaussians, semantics = self.load_both(log)
             predicted = self.load_predicted(gaussians, log)
@@ -84,9 +84,9 @@ class Segment(SemanticsOptions):
         """Label image and overlay of one view; returns their paths."""
         import numpy as np
 
-        from sgwarp.io.images import write_ids, write_rgb
-        from sgwarp.pictures import class_colours, overlay, with_legend
-        from sgwarp.segment import label_image
+        from sgwarp.files.images import write_ids, write_rgb
+        from sgwarp.querying.segmentation import label_image
+        from sgwarp.visualization.pictures import class_colours, overlay, with_legend
 
         labels = label_image(channel, lifted).numpy()
         path = self.out / f"{view.stem}.png"

@@ -14,11 +14,17 @@ import torch
 from torch import Tensor
 
 from sgwarp.errors import InputError
-from sgwarp.ops.harmonics import harmonics_sum
 from sgwarp.ops.neighbors import mean_squared_neighbor_distance
-from sgwarp.ops.projection import ProjectedSplats, ProjectionSettings, project_splats, select_rows, unpack_symmetric
-from sgwarp.ops.settings import RasterSettings
-from sgwarp.ops.splats import SplatJob, composite_splats
+from sgwarp.ops.planar.harmonics import harmonics_sum
+from sgwarp.ops.planar.projection import (
+    ProjectedSplats,
+    ProjectionSettings,
+    project_splats,
+    select_rows,
+    unpack_symmetric,
+)
+from sgwarp.ops.planar.splats import SplatJob, composite_splats
+from sgwarp.ops.splatting.settings import RasterSettings
 
 NEAR = 0.2  # [m]
 ALPHA_MAX = 0.99

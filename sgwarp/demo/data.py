@@ -10,8 +10,8 @@ from pathlib import Path
 import torch
 from torch import Tensor
 
-from sgwarp.io.files import read_bytes
-from sgwarp.io.images import read_ids
+from sgwarp.files.access import read_bytes
+from sgwarp.files.images import read_ids
 from sgwarp.io.scenes import load_gaussians
 from sgwarp.io.views import load_views
 from sgwarp.scene import FeatureMap, Gaussians, View

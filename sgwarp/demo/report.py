@@ -6,7 +6,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-from sgwarp.io.atomic import atomic_path
+from sgwarp.files.atomic import atomic_path
 
 
 @dataclass(frozen=True)

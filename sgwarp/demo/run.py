@@ -10,7 +10,7 @@ from pathlib import Path
 import torch
 
 from sgwarp.demo.data import FURNITURE, Room
-from sgwarp.demo.measure import measure
+from sgwarp.demo.measurement import measure
 from sgwarp.demo.report import Table, print_report, write_report
 from sgwarp.demo.sheets import (
     Trial,
@@ -23,11 +23,11 @@ from sgwarp.demo.sheets import (
 from sgwarp.encoders.base import MapSource, TextEncoder
 from sgwarp.encoders.registry import make_encoder, text_encoder_for
 from sgwarp.errors import InputError
-from sgwarp.lift import lift
-from sgwarp.ops.launch import get_threads, set_threads
-from sgwarp.ops.rasterize import rasterize
-from sgwarp.progress import show_progress
-from sgwarp.runlog import RunLog
+from sgwarp.lifting.lifter import lift
+from sgwarp.ops.launcher import get_threads, set_threads
+from sgwarp.ops.splatting.forward import rasterize
+from sgwarp.runs.log import RunLog
+from sgwarp.runs.progress import show_progress
 from sgwarp.scene import FeatureMap, View
 
 ENCODER = "conse"

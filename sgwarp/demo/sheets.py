@@ -11,10 +11,10 @@ import numpy as np
 from torch import Tensor
 
 from sgwarp.demo.data import FURNITURE, Room
-from sgwarp.demo.measure import Finding, Measurement
+from sgwarp.demo.measurement import Finding, Measurement
 from sgwarp.errors import InputError
-from sgwarp.io.atomic import atomic_path
-from sgwarp.pictures import Picture, depth_picture, heat_map, overlay, to_picture
+from sgwarp.files.atomic import atomic_path
+from sgwarp.visualization.pictures import Picture, depth_picture, heat_map, overlay, to_picture
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes

@@ -2,7 +2,7 @@
 
 The paper (Sec. III-B) knows three kinds of networks, which `compose` turns into feature maps: image-level ones
 (`ImageEncoder`), pixel-level ones (`PixelEncoder`) and instance-level ones (`InstanceEncoder`), each with a
-`MaskGenerator` such as SAM. What comes out is a `MapSource`, which `sgwarp.lift` asks for one map per view.
+`MaskGenerator` such as SAM. What comes out is a `MapSource`, which `sgwarp.lifting.lifter` asks for one map per view.
 """
 
 from __future__ import annotations
@@ -19,6 +19,10 @@ from sgwarp.scene import FeatureMap, View
 
 LEVELS = ("default", "s", "m", "l")  # all masks; small, middle and large ones (subpart, part and whole of SAM)
 UNRANKED = -1  # level of a mask whose generator knows no hierarchy
+
+
+class MissingMap(InputError):
+    """A view has no file in the folder; a caller with many views may skip it and count."""
 
 
 @dataclass(frozen=True, eq=False)

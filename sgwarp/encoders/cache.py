@@ -22,9 +22,9 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from sgwarp.encoders.base import MapSource, TextEncoder
-from sgwarp.encoders.feature_files import load_archive
+from sgwarp.encoders.maps.feature_files import load_archive
 from sgwarp.errors import InputError
-from sgwarp.io.atomic import atomic_path
+from sgwarp.files.atomic import atomic_path
 from sgwarp.scene import FeatureMap, View
 from sgwarp.version import __version__
 

@@ -14,7 +14,7 @@ from torch import Tensor
 from torch.nn.functional import interpolate, normalize
 
 from sgwarp.encoders.base import MapSource, TextEncoder
-from sgwarp.encoders.files import LABEL_SPACE
+from sgwarp.encoders.maps.files import LABEL_SPACE
 from sgwarp.errors import InputError
 from sgwarp.scene import FeatureMap, View
 

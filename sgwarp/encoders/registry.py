@@ -10,8 +10,8 @@ from typing import Any
 import torch
 
 from sgwarp.encoders.base import MapSource, MaskGenerator, TextEncoder, require_same_space
-from sgwarp.encoders.class_space import SPACE as CONSE_SPACE
-from sgwarp.encoders.files import LABEL_SPACE, open_files
+from sgwarp.encoders.images.conse.class_space import SPACE as CONSE_SPACE
+from sgwarp.encoders.maps.files import LABEL_SPACE, open_files
 from sgwarp.encoders.names import Member, Part, parse, parse_part
 from sgwarp.encoders.prompts import named_templates
 from sgwarp.errors import InputError
@@ -99,7 +99,7 @@ def _text_side(member: Member, device: Device, whole: str, templates: Sequence[s
     part = member.source
     chosen = {} if templates is None else {"templates": named_templates(templates)}
     if part.kind.name == "conse":
-        from sgwarp.encoders.conse_text import ConseText
+        from sgwarp.encoders.images.conse.text import ConseText
 
         return ConseText(**{**_templates(part), **chosen})
     if part.kind.name in JOINT:
@@ -131,11 +131,11 @@ def _make_member(member: Member, views: Sequence[View], device: Device, whole: s
     elif kind.name == "lseg":
         encoder = _lseg(part, device)
     elif kind.name == "openseg":
-        from sgwarp.encoders.openseg import OpenSeg
+        from sgwarp.encoders.pixels.openseg import OpenSeg
 
         encoder = OpenSeg(part.argument, _text_side(member, device, whole), part.options.get("pooled", True))
     else:
-        from sgwarp.encoders.clipseg import ClipSeg
+        from sgwarp.encoders.pixels.clipseg import ClipSeg
 
         options = _templates(part)
         encoder = ClipSeg(part.argument, part.options.get("classes", ()), device=device, **options)
@@ -151,7 +151,7 @@ def _make_member(member: Member, views: Sequence[View], device: Device, whole: s
 
 def _make_conse(member: Member, device: Device, whole: str) -> MapSource:
     from sgwarp.encoders.compose import Crops, MaskedImages, PlainPixels, RefinedPixels
-    from sgwarp.encoders.conse import Conse
+    from sgwarp.encoders.images.conse.encoder import Conse
 
     mode = member.source.argument
     if mode not in CONSE_MODES:
@@ -180,29 +180,29 @@ def _make_maps(part: Part, views: Sequence[View], device: Device) -> MapSource:
     if part.kind.name == "openscene":
         raise InputError(f"{part.name}: holds features per Gaussian, not per view; read it with sg.load_openscene")
     if part.kind.name == "deva":
-        from sgwarp.encoders.deva import DevaMaps
+        from sgwarp.encoders.maps.deva import DevaMaps
 
         return DevaMaps(part.argument, views, **part.options)
-    from sgwarp.encoders.closed_set import ClosedSet
+    from sgwarp.encoders.maps.closed_set import ClosedSet
 
     return ClosedSet(part.argument, device=device, **part.options)
 
 
 def _make_detector(part: Part, device: Device) -> Any:
     if part.kind.name == "vlpart":
-        from sgwarp.encoders.vlpart import VLPartFiles
+        from sgwarp.encoders.instances.vlpart import VLPartFiles
 
         return VLPartFiles(part.argument, **part.options)
-    from sgwarp.encoders.detections import DetectorSettings
+    from sgwarp.encoders.instances.detections import DetectorSettings
 
     classes = part.options.get("classes", ())
     least = 0.25 if part.kind.name == "gdino" else 0.1
     settings = DetectorSettings(**{"least_score": least, **_own(part, DetectorSettings)})
     if part.kind.name == "gdino":
-        from sgwarp.encoders.grounding_dino import GroundingDino
+        from sgwarp.encoders.instances.grounding_dino import GroundingDino
 
         return GroundingDino(part.argument, classes, settings, device)
-    from sgwarp.encoders.owlv2 import Owlv2
+    from sgwarp.encoders.instances.owlv2 import Owlv2
 
     return Owlv2(part.argument, classes, settings=settings, device=device, **_templates(part))
 
@@ -211,15 +211,15 @@ def _make_masks(part: Part | None, device: Device) -> MaskGenerator | None:
     if part is None:
         return None
     if part.kind.name == "masks":
-        from sgwarp.encoders.file_masks import FileMasks
+        from sgwarp.encoders.masks.files import FileMasks
 
         return FileMasks(part.argument)
     if part.kind.name in ("sam", "sam2", "sam3"):
-        from sgwarp.encoders.sam import Sam, SamSettings
+        from sgwarp.encoders.masks.sam import Sam, SamSettings
 
         by_rank = _levels(part) != ("default",)
         return Sam(part.argument, SamSettings(by_rank=by_rank, **_own(part, SamSettings)), device)
-    from sgwarp.encoders.proposals import Proposals
+    from sgwarp.encoders.masks.proposals import Proposals
 
     return Proposals(part.kind.name, **_own(part, Proposals))  # type: ignore[arg-type]
 
@@ -244,12 +244,12 @@ def _templates(part: Part) -> dict[str, Any]:
 
 
 def _joint(part: Part, device: Device, **chosen: Any) -> Any:
-    from sgwarp.encoders.clip import JointEncoder
+    from sgwarp.encoders.images.clip import JointEncoder
 
     return JointEncoder(part.argument, device=device, **(_some(part, "longest") | _templates(part) | chosen))
 
 
 def _lseg(part: Part, device: Device, **chosen: Any) -> Any:
-    from sgwarp.encoders.lseg import LSeg
+    from sgwarp.encoders.pixels.lseg import LSeg
 
     return LSeg(part.argument, device=device, **(_some(part, "longest", "tokenizer") | _templates(part) | chosen))

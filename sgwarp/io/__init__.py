@@ -1,1 +1,1 @@
-"""File formats: scenes (PLY), cameras (transforms.json, COLMAP), images, semantics."""
+"""File formats: scenes (PLY), cameras (transforms.json, COLMAP), semantics."""

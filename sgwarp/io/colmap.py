@@ -11,9 +11,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sgwarp.errors import InputError
+from sgwarp.files.images import read_size
 from sgwarp.io.colmap_model import ImageRecord, find_model, read_cameras, read_images
 from sgwarp.io.colmap_model import read_points as read_points
-from sgwarp.io.images import read_size
 from sgwarp.io.stems import unique_stems
 from sgwarp.io.undistort import Lens, pinhole_view
 from sgwarp.scene import View

@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sgwarp.errors import InputError
-from sgwarp.io.files import read_bytes
+from sgwarp.files.access import read_bytes
 from sgwarp.io.undistort import Lens
 
 # Number in the binary format -> name and number of parameters.

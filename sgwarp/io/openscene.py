@@ -14,7 +14,7 @@ import torch
 from torch import Tensor
 
 from sgwarp.errors import InputError
-from sgwarp.io.files import reading
+from sgwarp.files.access import reading
 from sgwarp.scene import Gaussians, Semantics
 
 

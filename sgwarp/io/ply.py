@@ -16,8 +16,8 @@ import torch
 from numpy.typing import NDArray
 
 from sgwarp.errors import InputError
-from sgwarp.io.atomic import atomic_path
-from sgwarp.io.files import reading
+from sgwarp.files.access import reading
+from sgwarp.files.atomic import atomic_path
 from sgwarp.scene import SH_COUNTS, Gaussians
 
 Elements = Mapping[str, NDArray[Any]]  # element name -> structured array, one field per property

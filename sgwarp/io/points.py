@@ -11,8 +11,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sgwarp.errors import InputError
+from sgwarp.files.access import read_bytes
 from sgwarp.io.colmap_model import find_model, read_points
-from sgwarp.io.files import read_bytes
 from sgwarp.io.ply import POSITION, columns, read_elements
 
 PLY_NAMES = ("points3D.ply", "sparse_pc.ply", "point_cloud.ply")  # beside a transforms.json that names none

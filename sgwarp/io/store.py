@@ -16,8 +16,8 @@ import torch
 from torch import Tensor
 
 from sgwarp.errors import InputError
-from sgwarp.io.atomic import atomic_path
-from sgwarp.io.files import reading
+from sgwarp.files.access import reading
+from sgwarp.files.atomic import atomic_path
 from sgwarp.scene import Gaussians, Semantics
 
 FORMAT = "sgwarp-semantics"

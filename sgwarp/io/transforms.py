@@ -14,8 +14,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sgwarp.errors import InputError
-from sgwarp.io.files import read_bytes
-from sgwarp.io.images import read_size
+from sgwarp.files.access import read_bytes
+from sgwarp.files.images import read_size
 from sgwarp.io.stems import IMAGE_SUFFIXES, unique_stems
 from sgwarp.io.undistort import Lens, pinhole_view
 from sgwarp.scene import View

@@ -1,1 +1,1 @@
-"""The only place where torch meets warp: rasterization and lifting on tensors, and their float64 oracle."""
+"""The only place where torch meets Warp: kernels as functions on tensors."""

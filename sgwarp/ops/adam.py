@@ -8,10 +8,10 @@ import torch
 import warp as wp
 from torch import Tensor
 
-from sgwarp.kernels import optimizing as kernels
-from sgwarp.kernels import optimizing_lanes
+from sgwarp.kernels.fitting import adam as kernels
+from sgwarp.kernels.fitting import adam_lanes as optimizing_lanes
 from sgwarp.kernels.transmittance import Lanes
-from sgwarp.ops.launch import launch, view
+from sgwarp.ops.launcher import launch, view
 
 LANE = 16
 BETAS = (float(kernels.BETA_1), float(kernels.BETA_2))

@@ -9,8 +9,8 @@ import warp as wp
 from torch import Tensor
 
 from sgwarp.errors import InputError
-from sgwarp.kernels import deformation
-from sgwarp.ops.launch import launch, view
+from sgwarp.kernels.points import deformation
+from sgwarp.ops.launcher import launch, view
 from sgwarp.scene import Gaussians
 
 

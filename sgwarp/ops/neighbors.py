@@ -7,8 +7,8 @@ import warp as wp
 from torch import Tensor
 
 from sgwarp.errors import InputError
-from sgwarp.kernels import neighbors
-from sgwarp.ops.launch import launch, view
+from sgwarp.kernels.points import neighbors
+from sgwarp.ops.launcher import launch, view
 
 FAN = neighbors.FAN  # points in a box, boxes in a larger one
 CURVE_BITS = 20  # per axis of the space-filling curve

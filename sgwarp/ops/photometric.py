@@ -9,9 +9,9 @@ import warp as wp
 from torch import Tensor
 
 from sgwarp.errors import InputError
-from sgwarp.kernels import photometric as kernels
+from sgwarp.kernels.fitting import photometric as kernels
 from sgwarp.kernels.transmittance import LANES, Lanes
-from sgwarp.ops.launch import launch, scratch, view
+from sgwarp.ops.launcher import launch, scratch, view
 
 FLOAT_BYTES = 4
 

@@ -7,9 +7,9 @@ import torch
 
 from sgwarp.compat import gsplat
 from sgwarp.errors import InputError
-from sgwarp.ops import reference
-from sgwarp.ops.rasterize import rasterize
-from sgwarp.ops.settings import RasterSettings
+from sgwarp.ops.reference import rasterizer as reference
+from sgwarp.ops.splatting.forward import rasterize
+from sgwarp.ops.splatting.settings import RasterSettings
 from sgwarp.scene import Camera, Gaussians
 
 META_KEYS = {

@@ -11,7 +11,7 @@ import torch
 from torch import Tensor
 
 from sgwarp.compat import gsplat
-from sgwarp.ops import reference
+from sgwarp.ops.reference import rasterizer as reference
 
 BATCH, CAMERAS = 2, 2
 BOUNDARY_BAND = 1e-4  # pixels nearer than this to a threshold, or to a change of the order, may flip in float32

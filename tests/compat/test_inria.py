@@ -8,7 +8,7 @@ import torch
 
 from sgwarp.compat.inria import GaussianRasterizationSettings, GaussianRasterizer, dist2
 from sgwarp.errors import InputError
-from sgwarp.ops import reference
+from sgwarp.ops.reference import rasterizer as reference
 
 WIDTH, HEIGHT = 45, 37
 

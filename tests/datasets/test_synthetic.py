@@ -4,8 +4,8 @@ import pytest
 import torch
 
 from sgwarp.datasets.synthetic import CLASSES, FURNITURE, make_room, room_cameras
-from sgwarp.ops.reference import rotation_matrices
-from sgwarp.render import render
+from sgwarp.ops.reference.rasterizer import rotation_matrices
+from sgwarp.rendering.renderer import render
 
 COUNT = 6000
 

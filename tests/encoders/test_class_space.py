@@ -4,7 +4,13 @@ import numpy as np
 import pytest
 import torch
 
-from sgwarp.encoders.class_space import TEMPERATURE, TOP_CLASSES, ClassSpace, imagenet_classes, imagenet_space
+from sgwarp.encoders.images.conse.class_space import (
+    TEMPERATURE,
+    TOP_CLASSES,
+    ClassSpace,
+    imagenet_classes,
+    imagenet_space,
+)
 
 
 def test_stored_space_belongs_to_the_names():

@@ -8,7 +8,7 @@ import torch
 from torch.nn.functional import normalize
 
 from sgwarp.encoders.base import TextEncoder
-from sgwarp.encoders.clip import JointEncoder
+from sgwarp.encoders.images.clip import JointEncoder
 from sgwarp.encoders.prompts import PLAIN
 from sgwarp.encoders.weights import Preparation, identity_of_weights, load_model
 from sgwarp.errors import InputError

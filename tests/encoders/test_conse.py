@@ -9,12 +9,12 @@ import pytest
 import torch
 
 from sgwarp.encoders.base import MapSource, TextEncoder
-from sgwarp.encoders.class_space import SPACE, imagenet_classes, imagenet_space
 from sgwarp.encoders.compose import Crops, MaskedImages, PlainPixels
-from sgwarp.encoders.conse import Conse, ConseSettings
-from sgwarp.encoders.conse_text import ConseText, encode_sentences
-from sgwarp.encoders.imagenet_classifier import ImageClassifier
-from sgwarp.encoders.proposals import Proposals
+from sgwarp.encoders.images.conse.class_space import SPACE, imagenet_classes, imagenet_space
+from sgwarp.encoders.images.conse.classifier import ImageClassifier
+from sgwarp.encoders.images.conse.encoder import Conse, ConseSettings
+from sgwarp.encoders.images.conse.text import ConseText, encode_sentences
+from sgwarp.encoders.masks.proposals import Proposals
 from sgwarp.encoders.registry import make_encoder, text_encoder_for
 from sgwarp.errors import InputError
 from sgwarp.scene import Camera, View
@@ -241,7 +241,7 @@ def test_templates_are_averaged():
 def test_texts_are_encoded_once(monkeypatch):
     encoder = ConseText()
     first = encoder.encode_text(["cup", "lamp", "cup"])
-    monkeypatch.setattr("sgwarp.encoders.conse_text.encode_sentences", None)
+    monkeypatch.setattr("sgwarp.encoders.images.conse.text.encode_sentences", None)
     assert encoder.encode_text(["lamp", "cup"]).tolist() == [first[1].tolist(), first[0].tolist()]
 
 
@@ -255,7 +255,8 @@ def test_texts_are_encoded_once(monkeypatch):
     ],
 )
 def test_missing_package(monkeypatch, package, use):
-    from sgwarp.encoders import conse_text, imagenet_classifier
+    from sgwarp.encoders.images.conse import classifier as imagenet_classifier
+    from sgwarp.encoders.images.conse import text as conse_text
 
     conse_text._sentence_model.cache_clear()
     imagenet_classifier._load.cache_clear()

@@ -4,11 +4,11 @@ import pytest
 import torch
 
 from sgwarp.encoders.base import InstanceEncoder
-from sgwarp.encoders.clipseg import ClipSeg
-from sgwarp.encoders.closed_set import ClosedSet, class_shares
-from sgwarp.encoders.detections import DetectorSettings, keep_detections
-from sgwarp.encoders.grounding_dino import GroundingDino
-from sgwarp.encoders.owlv2 import Owlv2
+from sgwarp.encoders.instances.detections import DetectorSettings, keep_detections
+from sgwarp.encoders.instances.grounding_dino import GroundingDino
+from sgwarp.encoders.instances.owlv2 import Owlv2
+from sgwarp.encoders.maps.closed_set import ClosedSet, class_shares
+from sgwarp.encoders.pixels.clipseg import ClipSeg
 from sgwarp.errors import InputError
 
 ALL = DetectorSettings(least_score=0.0, overlap=1.0)

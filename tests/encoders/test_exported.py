@@ -7,11 +7,11 @@ import numpy as np
 import pytest
 import torch
 
-from sgwarp.encoders.base import UNRANKED
-from sgwarp.encoders.deva import DevaMaps
-from sgwarp.encoders.file_masks import FileMasks
-from sgwarp.encoders.files import FileMaps, MissingMap
-from sgwarp.encoders.vlpart import VLPartFiles, decode_rle, plain_name
+from sgwarp.encoders.base import UNRANKED, MissingMap
+from sgwarp.encoders.instances.vlpart import VLPartFiles, decode_rle, plain_name
+from sgwarp.encoders.maps.deva import DevaMaps
+from sgwarp.encoders.maps.files import FileMaps
+from sgwarp.encoders.masks.files import FileMasks
 from sgwarp.errors import InputError
 
 MASK = np.zeros((48, 64), bool)

@@ -10,7 +10,8 @@ import pytest
 import torch
 from safetensors.numpy import save_file
 
-from sgwarp.encoders.files import FileMaps, MissingMap
+from sgwarp.encoders.base import MissingMap
+from sgwarp.encoders.maps.files import FileMaps
 from sgwarp.encoders.registry import make_encoder
 from sgwarp.errors import InputError
 from sgwarp.scene import Camera, View

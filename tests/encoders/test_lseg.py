@@ -6,8 +6,8 @@ import pytest
 import torch
 from torch.nn.functional import normalize
 
-from sgwarp.encoders.lseg import LSeg, clip_text_tower
-from sgwarp.encoders.lseg_network import Fusion, LSegNetwork, LSegShape
+from sgwarp.encoders.pixels.lseg import LSeg, clip_text_tower
+from sgwarp.encoders.pixels.lseg_network import Fusion, LSegNetwork, LSegShape
 from sgwarp.errors import InputError
 
 WIDTH, DEPTH, PATCH, GRID, LEVELS, FEATURES, CHANNELS = 128, 8, 16, 4, (8, 12, 16, 20), 8, 24

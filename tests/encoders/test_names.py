@@ -10,15 +10,15 @@ import torch
 from sgwarp.encoders import catalogue
 from sgwarp.encoders.cache import CachedMaps
 from sgwarp.encoders.catalogue import BY_NAME, KINDS
-from sgwarp.encoders.clip import JointEncoder
 from sgwarp.encoders.compose import Crops, MaskedImages, PaintedInstances, PlainPixels, RefinedPixels
 from sgwarp.encoders.ensemble import Ensemble
-from sgwarp.encoders.file_masks import FileMasks
+from sgwarp.encoders.images.clip import JointEncoder
+from sgwarp.encoders.instances.vlpart import VLPartFiles
+from sgwarp.encoders.masks.files import FileMasks
+from sgwarp.encoders.masks.proposals import Proposals
+from sgwarp.encoders.masks.sam import Sam
 from sgwarp.encoders.names import parse
-from sgwarp.encoders.proposals import Proposals
 from sgwarp.encoders.registry import make_encoder, make_text_encoder, text_encoder_for
-from sgwarp.encoders.sam import Sam
-from sgwarp.encoders.vlpart import VLPartFiles
 from sgwarp.errors import InputError
 
 

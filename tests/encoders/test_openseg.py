@@ -5,7 +5,7 @@ import pytest
 import torch
 from torch.nn.functional import normalize
 
-from sgwarp.encoders.openseg import OpenSeg
+from sgwarp.encoders.pixels.openseg import OpenSeg
 from sgwarp.errors import InputError
 
 CHANNELS = 6

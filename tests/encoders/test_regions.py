@@ -5,9 +5,9 @@ import numpy as np
 import pytest
 import torch
 
-from sgwarp.encoders.imagenet_classifier import STRIDE, LogitMap
+from sgwarp.encoders.images.conse.classifier import STRIDE, LogitMap
+from sgwarp.encoders.masks.proposals import Proposals, propose_regions, segment_regions
 from sgwarp.encoders.painting import spread
-from sgwarp.encoders.proposals import Proposals, propose_regions, segment_regions
 from sgwarp.encoders.regions import box_squares, cut_squares, mask_boxes
 from sgwarp.errors import InputError
 from sgwarp.scene import Camera, View

@@ -5,7 +5,7 @@ import pytest
 import torch
 
 from sgwarp.encoders.base import Masks
-from sgwarp.encoders.sam import CLASSES, Sam, SamSettings, best_boxes, without_repetitions
+from sgwarp.encoders.masks.sam import CLASSES, Sam, SamSettings, best_boxes, without_repetitions
 from sgwarp.errors import InputError
 
 LOOSE = SamSettings(
@@ -65,7 +65,7 @@ def test_boxes(sam_models, kind, image):
 
 def test_everything_asks_at_a_grid_of_points(sam_models, kind, image, tools, monkeypatch):
     """Loose settings leave out nothing but empty masks: three for the middle of each of 3 x 3 cells."""
-    monkeypatch.setattr("sgwarp.encoders.sam.without_repetitions", lambda masks, overlap, by_rank: masks)
+    monkeypatch.setattr("sgwarp.encoders.masks.sam.without_repetitions", lambda masks, overlap, by_rank: masks)
     points = torch.tensor([[(x + 0.5) * 80 / 3, (y + 0.5) * 48 / 3] for y in range(3) for x in range(3)])
     logits, answers = by_hand(sam_models[kind], kind, image, input_points=points[None, :, None])
     wanted = (logits > 0).flatten(1)

@@ -1,13 +1,9 @@
 """Writers that share nothing with the package: bytes are packed one by one with struct."""
 
 import struct
-from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager
-from pathlib import Path
+from collections.abc import Callable, Sequence
 
 import pytest
-
-from sgwarp.errors import InputError
 
 CODES = {
     "char": "b",
@@ -39,21 +35,6 @@ def _ply_bytes(elements: Sequence[Element], form: str = "binary_little_endian", 
     return (newline.join([*header, "end_header"]) + newline).encode() + body
 
 
-@contextmanager
-def _allow_input_error(path: Path) -> Iterator[None]:
-    try:
-        yield
-    except InputError as error:
-        if not str(error).startswith(str(path)) or "\n" in str(error):
-            pytest.fail(f"not one line that begins with {path}: {error}")
-
-
 @pytest.fixture(scope="session")
 def ply_bytes() -> Callable[..., bytes]:
     return _ply_bytes
-
-
-@pytest.fixture(scope="session")
-def allow_input_error():
-    """Context manager for random input: either the block passes or an InputError names the file on one line."""
-    return _allow_input_error

@@ -4,10 +4,12 @@ import pytest
 import torch
 import warp as wp
 
-from sgwarp.kernels import projection, projection_backward, projection_lanes
-from sgwarp.ops import tiles
-from sgwarp.ops.launch import launch, view
-from sgwarp.ops.settings import RasterSettings
+from sgwarp.kernels.projection import backward as projection_backward
+from sgwarp.kernels.projection import forward as projection
+from sgwarp.kernels.projection import lanes as projection_lanes
+from sgwarp.ops.launcher import launch, view
+from sgwarp.ops.splatting import tiles
+from sgwarp.ops.splatting.settings import RasterSettings
 from sgwarp.scene import Camera, Gaussians
 
 CPU = torch.device("cpu")

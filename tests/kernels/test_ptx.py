@@ -2,7 +2,6 @@
 
 import importlib
 import itertools
-import pkgutil
 import re
 import shutil
 import subprocess
@@ -13,8 +12,12 @@ import pytest
 import warp as wp
 
 import sgwarp.kernels
-from sgwarp.kernels import compositing_block, compositing_block_backward, lifting_block, pixel_lists, voxels
-from sgwarp.ops import launch  # noqa: F401 - starts Warp quietly
+from sgwarp.kernels.compositing import block as compositing_block
+from sgwarp.kernels.compositing import block_backward as compositing_block_backward
+from sgwarp.kernels.contributors import pairs as pixel_lists
+from sgwarp.kernels.lifting import block as lifting_block
+from sgwarp.kernels.sparse import voxels
+from sgwarp.ops import launcher  # noqa: F401 - starts Warp quietly
 
 ARCHITECTURES = (80, 86, 89, 90)
 
@@ -22,9 +25,11 @@ ARCHITECTURES = (80, 86, 89, 90)
 def cuda_kernels() -> list[wp.Kernel]:
     """All kernels defined in kernels/ but the lane schedule's, which only the CPU runs, and one of each factory."""
     kernels = []
-    for info in pkgutil.iter_modules(sgwarp.kernels.__path__):
-        if "_lanes" not in info.name:
-            module = importlib.import_module(f"sgwarp.kernels.{info.name}")
+    root = Path(sgwarp.kernels.__path__[0])
+    for file in sorted(root.rglob("*.py")):
+        if "lanes" not in file.stem:
+            dotted = ".".join(file.relative_to(root).with_suffix("").parts)
+            module = importlib.import_module(f"sgwarp.kernels.{dotted}")
             kernels += [
                 k for k in vars(module).values() if isinstance(k, wp.Kernel) and k.module.name == module.__name__
             ]

@@ -19,7 +19,7 @@ def is_kernel(node: ast.AST) -> bool:
 def kernels_in_the_sources() -> dict[str, tuple[list[str], str | None]]:
     """Arguments of every kernel and the signature of the factory that makes it, read from the sources."""
     found = {}
-    for path in sorted(KERNELS.glob("*.py")):
+    for path in sorted(KERNELS.rglob("*.py")):
         for node in ast.parse(path.read_text(encoding="utf-8")).body:
             for kernel in filter(is_kernel, ast.walk(node)):
                 factory = f"{node.name}({', '.join(a.arg for a in node.args.args)})" if kernel is not node else None
@@ -76,8 +76,8 @@ def test_a_row_names_all_arguments_and_the_factory(name):
 
 
 def test_every_file_is_listed():
-    files = {path.name for path in KERNELS.glob("*.py")}
-    assert files == set(re.findall(r"`(\w+\.py)`", README.split("## Files")[1].split("## Two schedules")[0]))
+    files = {path.relative_to(KERNELS).as_posix() for path in KERNELS.rglob("*.py")}
+    assert files == set(re.findall(r"`([\w/]+\.py)`", README.split("## Files")[1].split("## Two schedules")[0]))
 
 
 def test_the_example_runs(capsys):

@@ -3,9 +3,10 @@
 import pytest
 import torch
 
-from sgwarp.ops import launch, reference_fit
+from sgwarp.ops import launcher
 from sgwarp.ops.adam import Group, add_noise, count_steps, note_gradients, update, values_of
-from sgwarp.ops.reference import rotation_matrices
+from sgwarp.ops.reference import fitting as reference_fit
+from sgwarp.ops.reference.rasterizer import rotation_matrices
 
 ROWS, STEPS = 40, 25
 
@@ -176,13 +177,13 @@ def test_noise_moves_the_faint_within_their_extent():
 
 def test_noise_depends_on_the_seed_and_the_row_alone():
     def moved(seed: int, threads: int) -> torch.Tensor:
-        before = launch.get_threads()
-        launch.set_threads(threads)
+        before = launcher.get_threads()
+        launcher.set_threads(threads)
         try:
             means = torch.zeros(1000, 3)
             add_noise(means, torch.ones(1000, 4), torch.ones(1000, 3), torch.zeros(1000), seed, 1.0)
         finally:
-            launch.set_threads(before)
+            launcher.set_threads(before)
         return means
 
     assert torch.equal(moved(3, 1), moved(3, 4))

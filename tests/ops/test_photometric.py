@@ -4,8 +4,9 @@ import pytest
 import torch
 
 from sgwarp.errors import InputError
-from sgwarp.ops import launch, reference_fit
+from sgwarp.ops import launcher
 from sgwarp.ops.photometric import photometric_loss
+from sgwarp.ops.reference import fitting as reference_fit
 
 # Of the loss, and of the gradient relative to its largest. Without contrast the variance is the difference of moments
 # of 1/4, each off by some 5 units of 2^-25 after two passes, beside the stabiliser 9e-4: 3e-4 of the gradient.
@@ -60,16 +61,16 @@ def test_a_stale_margin_of_another_size_does_not_leak_in():
 
 def test_the_number_of_threads_does_not_change_a_bit():
     image, truth = pictures(64, 50, "noisy")
-    before, results = launch.get_threads(), []
+    before, results = launcher.get_threads(), []
     try:
         for threads in (1, 2, 5):
-            launch.set_threads(threads)
+            launcher.set_threads(threads)
             leaf = image.clone().requires_grad_()
             loss = photometric_loss(leaf, truth)
             loss.backward()
             results.append((loss.detach(), leaf.grad))
     finally:
-        launch.set_threads(before)
+        launcher.set_threads(before)
     for loss, gradient in results[1:]:
         assert torch.equal(loss, results[0][0])
         assert torch.equal(gradient, results[0][1])

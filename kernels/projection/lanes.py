@@ -1,0 +1,370 @@
+"""Gaussian -> splat, lane schedule (CPU): `project_gaussians` for 16 Gaussians at a time, in C++ (`native.py`).
+
+The maths and its order are those of `projection.py` and `projection_backward.py`, where they are explained; the tests
+compare them splat by splat. Comparisons are exact about NaN and infinity, as there.
+"""
+
+import warp as wp
+
+from sgwarp.kernels.gaussian import EXACT_OPTIONS, LOG2_E, MIN_QUAT_NORM2, UNIT, Pinhole, Splat
+from sgwarp.kernels.native import snippet
+from sgwarp.kernels.projection.backward import LN_2, SEEN
+from sgwarp.kernels.projection.forward import (
+    DEGENERATE,
+    NON_FINITE,
+    OFF_SCREEN,
+    OUTSIDE_DEPTH,
+    TRANSPARENT,
+    VISIBLE,
+    Knobs,
+)
+
+wp.set_module_options(
+    EXACT_OPTIONS | {"cpu_compiler_flags": f"{EXACT_OPTIONS['cpu_compiler_flags']} -mprefer-vector-width=512"}
+)
+
+GROUP = 16  # Gaussians of a kernel thread
+
+# Columns of 16 Gaussians, and back; what lies beyond the last repeats it.
+COLUMNS = """
+    const int first = group * 16, count = means.shape[0] - first < 16 ? means.shape[0] - first : 16;
+    const auto columns = [&](const float* from, int width, Row* to) {
+        for (int i = 0; i < 16; ++i)
+            for (int j = 0; j < width; ++j) to[j][i] = from[(i < count ? i : count - 1) * width + j];
+    };
+    Row mean[3], quat[4], scale[3], given[1];
+    columns(reinterpret_cast<const float*>(means.data + first), 3, mean);
+    columns(reinterpret_cast<const float*>(quats.data + first), 4, quat);
+    columns(reinterpret_cast<const float*>(scales.data + first), 3, scale);
+    columns(opacities.data + first, 1, given);
+    const auto root = [](Row x) -> Row { return __builtin_elementwise_sqrt(x); };
+    const auto& view = camera.rotation.data;
+"""
+
+# The centre seen from the camera: `away` in the world's axes, `point` in the camera's.
+POINT = """
+    Row away[3], point[3];
+    for (int j = 0; j < 3; ++j) away[j] = (mean[j] - camera.center[j]) - camera.center_rest[j];
+    for (int j = 0; j < 3; ++j) point[j] = view[j][0] * away[0] + view[j][1] * away[1] + view[j][2] * away[2];
+"""
+
+# Rows of J: (fx, 0, sx) and (0, fy, sy), with x/z and y/z clamped.
+JACOBIAN = """
+    const Row inv_z = 1.0f / point[2];
+    Row slope[2], tangent[2];
+    for (int j = 0; j < 2; ++j) {
+        slope[j] = point[j] * inv_z;
+        const Row low = zero + camera.tangent_min[j], high = zero + camera.tangent_max[j];
+        const Row clamped = slope[j] < low ? low : slope[j];
+        tangent[j] = clamped > high ? high : clamped;
+    }
+    const Row fx = camera.focal[0] * inv_z, fy = camera.focal[1] * inv_z, sx = -fx * tangent[0], sy = -fy * tangent[1];
+"""
+
+# M = J W R S, rows m_x and m_y; `along` is M without the scales. Determinant and entries of the dilated M M^T.
+FACTOR = """
+    const Row norm2 = quat[0] * quat[0] + quat[1] * quat[1] + quat[2] * quat[2] + quat[3] * quat[3], s = 2.0f / norm2;
+    const Row qx = s * quat[1], qy = s * quat[2], qz = s * quat[3];
+    const Row w_x = qx * quat[0], w_y = qy * quat[0], w_z = qz * quat[0], x_x = qx * quat[1], x_y = qx * quat[2];
+    const Row x_z = qx * quat[3], y_y = qy * quat[2], y_z = qy * quat[3], z_z = qz * quat[3];
+    const Row R[3][3] = {{1.0f - (y_y + z_z), x_y - w_z, x_z + w_y},
+                         {x_y + w_z, 1.0f - (x_x + z_z), y_z - w_x},
+                         {x_z - w_y, y_z + w_x, 1.0f - (x_x + y_y)}};
+    Row axes[3][3], along_x[3], along_y[3], m_x[3], m_y[3];
+    for (int j = 0; j < 3; ++j) {
+        for (int i = 0; i < 3; ++i) axes[i][j] = view[i][0] * R[0][j] + view[i][1] * R[1][j] + view[i][2] * R[2][j];
+        along_x[j] = fx * axes[0][j] + sx * axes[2][j], along_y[j] = fy * axes[1][j] + sy * axes[2][j];
+        m_x[j] = along_x[j] * scale[j], m_y[j] = along_y[j] * scale[j];
+    }
+    const Row minors[3] = {m_x[1] * m_y[2] - m_x[2] * m_y[1], m_x[2] * m_y[0] - m_x[0] * m_y[2],
+                           m_x[0] * m_y[1] - m_x[1] * m_y[0]};
+    const Row sharp = minors[0] * minors[0] + minors[1] * minors[1] + minors[2] * minors[2];
+    Row xx = m_x[0] * m_x[0] + m_x[1] * m_x[1] + m_x[2] * m_x[2];
+    Row yy = m_y[0] * m_y[0] + m_y[1] * m_y[1] + m_y[2] * m_y[2];
+    const Row xy = m_x[0] * m_y[0] + m_x[1] * m_y[1] + m_x[2] * m_y[2];
+    const Row determinant = sharp + knobs.dilation * (xx + yy) + knobs.dilation * knobs.dilation;
+    xx += knobs.dilation;
+    yy += knobs.dilation;
+    const Row root_det = root(determinant), inv_y = 1.0f / root(yy), scaled = UNIT * inv_y / root_det;
+    const Row a = scaled * yy, b = -scaled * xy, c = UNIT * inv_y;
+"""
+
+PROJECT = (
+    COLUMNS
+    + """
+    const auto magnitude = [](Row x) -> Row { return __builtin_elementwise_abs(x); };
+    const auto larger = [](Row x, Row y) -> Row { return x > y ? x : y; };
+    const float largest_float = 3.4028234e38f;
+
+    // Why each is left out: the first reason that holds.
+    const Ints visible = VISIBLE;
+    Ints status = visible;
+    const auto leave_out = [&](Ints holds, int reason) {
+        const Ints code = reason;
+        status = (status == visible) & holds ? code : status;
+    };
+    const Row length2 = quat[0] * quat[0] + quat[1] * quat[1] + quat[2] * quat[2] + quat[3] * quat[3];
+    Row total = magnitude(given[0]) + length2;
+    for (int j = 0; j < 3; ++j) total += magnitude(mean[j]) + magnitude(scale[j]);
+    leave_out(~(total <= largest_float) | ~(length2 >= MIN_NORM2), NON_FINITE);
+    leave_out(given[0] < knobs.alpha_min, TRANSPARENT);
+
+    POINT
+    leave_out(~((point[2] > camera.near) & (point[2] < camera.far)), OUTSIDE_DEPTH);
+    if (!bits(status == visible)) {
+        for (int i = 0; i < count; ++i) status_out.data[first + i] = status[i];
+        return;
+    }
+
+    JACOBIAN
+    const Row x = camera.focal[0] * slope[0] + camera.principal[0];
+    const Row y = camera.focal[1] * slope[1] + camera.principal[1];
+    // Not even a round, opaque Gaussian of the largest scale would reach the image.
+    const Row largest = larger(larger(scale[0], scale[1]), scale[2]), largest2 = largest * largest;
+    const float reach2 = (LEVEL_SLACK - knobs.alpha_min_level) * 2.0f / LOG2_E;
+    const float width = camera.width, height = camera.height;
+    const Row off_x = larger(larger(-x, x - width), zero), off_y = larger(larger(-y, y - height), zero);
+    leave_out((off_x * off_x > reach2 * (largest2 * (fx * fx + sx * sx) + knobs.dilation))
+            | (off_y * off_y > reach2 * (largest2 * (fy * fy + sy * sy) + knobs.dilation)), OFF_SCREEN);
+
+    FACTOR
+    leave_out(~((determinant > zero) & (determinant <= largest_float) & (yy > zero)), DEGENERATE);
+    Row alpha = given[0];
+    if (knobs.antialiased) {
+        alpha *= root(sharp / determinant);
+        leave_out(alpha < knobs.alpha_min, TRANSPARENT);
+    }
+
+    const Row root_xx = root(xx), root_yy = root(yy);
+    // log2 alpha: the exponent, and the mantissa m in (sqrt 1/2, sqrt 2) by artanh((m - 1) / (m + 1)).
+    const Ints pattern = reinterpret_cast<Ints>(alpha), shifted = pattern - 0x3f3504f3;
+    const Row whole = __builtin_convertvector(shifted >> 23, Row);
+    const Row m = reinterpret_cast<Row>((shifted & 0x7fffff) + 0x3f3504f3);
+    const Row t = (m - 1.0f) / (m + 1.0f), t2 = t * t;
+    const Row series = ((t2 * 0.1111111f + 0.14285715f) * t2 + 0.2f) * t2 + 0.33333334f;
+    const Row level = whole + 2.885390082f * (t + t * t2 * series);
+    const Row reach = level - knobs.alpha_min_level + LEVEL_SLACK, radius = root(reach) * (1.0f / UNIT);
+    const Row half_width = radius * root_xx, half_height = radius * root_yy;
+    const Row inv_bc = root_det / root_xx * (1.0f / UNIT), summit = -b * half_height * inv_bc;
+    leave_out(~((x + half_width >= 0.5f) & (x - half_width <= width - 0.5f) & (y + half_height >= 0.5f)
+              & (y - half_height <= height - 0.5f)), OFF_SCREEN);
+
+    for (int i = 0; i < count; ++i) status_out.data[first + i] = status[i];
+    for (int i = 0; i < count; ++i) depths_out.data[first + i] = point[2][i];
+    Row lines[16] = {x, y, a, b, c, level, point[2], half_width, half_height, reach, summit, inv_bc};
+    transpose(lines);
+    for (unsigned left = bits(status == visible) & ((1u << count) - 1); left; left &= left - 1) {
+        const int i = __builtin_ctz(left);
+        reinterpret_cast<Row*>(splats_out.data)[first + i] = lines[i];
+    }
+""".replace("    POINT\n", POINT)
+    .replace("    JACOBIAN\n", JACOBIAN)
+    .replace("    FACTOR\n", FACTOR)
+)
+
+
+BACKWARD = (
+    COLUMNS
+    + """
+    Row moments[16];
+    const Row* const rows = reinterpret_cast<const Row*>(sums.data) + first;
+    for (int i = 0; i < 16; ++i) moments[i] = rows[i < count ? i : count - 1];
+    transpose(moments);
+    const Ints seen = moments[SEEN] != zero;
+    const auto write = [&](float* to, int width, const Row* from) {
+        for (int j = 0; j < width; ++j) {
+            const Row kept = seen ? from[j] : zero;
+            for (int i = 0; i < count; ++i) to[i * width + j] = kept[i];
+        }
+    };
+    POINT
+    JACOBIAN
+    FACTOR
+    const Row g = LN_2 * moments[0], gu = LN_2 * moments[1], gv = LN_2 * moments[2];
+    const Row guu = LN_2 * moments[3], guv = LN_2 * moments[4], gvv = LN_2 * moments[5];
+    const Row v_pixel[2] = {2.0f * a * gu, 2.0f * (b * gu + c * gv)};
+    // N = L^T M, then L (moments N).
+    Row v_x[3], v_y[3];
+    for (int j = 0; j < 3; ++j) {
+        const Row n_u = a * m_x[j] + b * m_y[j], n_v = c * m_y[j];
+        const Row q_u = (4.0f / LOG2_E) * (guu * n_u + guv * n_v), q_v = (4.0f / LOG2_E) * (guv * n_u + gvv * n_v);
+        v_x[j] = a * q_u, v_y[j] = b * q_u + c * q_v;
+    }
+    if (knobs.antialiased) {
+        // opacity sqrt(sharp / determinant): half the logarithm of both.
+        const Row half = 0.5f * moments[0], v_sharp = half * (1.0f / sharp - 1.0f / determinant);
+        const Row v_trace = -half * knobs.dilation / determinant;
+        for (int j = 0; j < 3; ++j) {
+            const int k = (j + 1) % 3, l = (j + 2) % 3;
+            v_x[j] += 2.0f * (v_sharp * (m_y[k] * minors[l] - m_y[l] * minors[k]) + v_trace * m_x[j]);
+            v_y[j] += 2.0f * (v_sharp * (minors[k] * m_x[l] - minors[l] * m_x[k]) + v_trace * m_y[j]);
+        }
+    }
+    Row scaled_x[3], scaled_y[3], v_scale[3], v_axes[3][3];
+    for (int j = 0; j < 3; ++j) {
+        scaled_x[j] = v_x[j] * scale[j], scaled_y[j] = v_y[j] * scale[j];
+        v_scale[j] = v_x[j] * along_x[j] + v_y[j] * along_y[j];
+        v_axes[0][j] = fx * scaled_x[j], v_axes[1][j] = fy * scaled_y[j];
+        v_axes[2][j] = sx * scaled_x[j] + sy * scaled_y[j];
+    }
+    // Of the rows of J; where x/z or y/z is clamped, J does not depend on it.
+    Row row_x[3], row_y[3];
+    for (int i = 0; i < 3; ++i) {
+        row_x[i] = axes[i][0] * scaled_x[0] + axes[i][1] * scaled_x[1] + axes[i][2] * scaled_x[2];
+        row_y[i] = axes[i][0] * scaled_y[0] + axes[i][1] * scaled_y[1] + axes[i][2] * scaled_y[2];
+    }
+    const Row free_x = tangent[0] == slope[0] ? fx * row_x[2] : zero;
+    const Row free_y = tangent[1] == slope[1] ? fy * row_y[2] : zero;
+    const Row v_slope_x = camera.focal[0] * v_pixel[0] - free_x, v_slope_y = camera.focal[1] * v_pixel[1] - free_y;
+    const Row v_inv_z = camera.focal[0] * (row_x[0] - tangent[0] * row_x[2])
+                      + camera.focal[1] * (row_y[1] - tangent[1] * row_y[2]);
+    Row v_point[3] = {v_slope_x * inv_z, v_slope_y * inv_z,
+                      (-slope[0] * v_slope_x - slope[1] * v_slope_y - v_inv_z * inv_z) * inv_z};
+    if (at_depth >= 0) v_point[2] += moments[at_depth];
+    // From the camera's axes to the world's.
+    Row v_mean[3], v[3][3];
+    for (int i = 0; i < 3; ++i) {
+        v_mean[i] = view[0][i] * v_point[0] + view[1][i] * v_point[1] + view[2][i] * v_point[2];
+        for (int j = 0; j < 3; ++j)
+            v[i][j] = view[0][i] * v_axes[0][j] + view[1][i] * v_axes[1][j] + view[2][i] * v_axes[2][j];
+    }
+    // `quaternion_gradient`.
+    const Row inv_length = 1.0f / root(norm2);
+    const Row unit[4] = {quat[0] * inv_length, quat[1] * inv_length, quat[2] * inv_length, quat[3] * inv_length};
+    const Row qw = unit[0], ux = unit[1], uy = unit[2], uz = unit[3];
+    const Row yz = v[2][1] - v[1][2], zx = v[0][2] - v[2][0], xy_ = v[1][0] - v[0][1];
+    const Row s_xy = v[0][1] + v[1][0], s_xz = v[0][2] + v[2][0], s_yz = v[1][2] + v[2][1];
+    Row v_quat[4] = {2.0f * (ux * yz + uy * zx + uz * xy_),
+                     2.0f * (qw * yz + uy * s_xy + uz * s_xz - 2.0f * ux * (v[1][1] + v[2][2])),
+                     2.0f * (qw * zx + ux * s_xy + uz * s_yz - 2.0f * uy * (v[0][0] + v[2][2])),
+                     2.0f * (qw * xy_ + ux * s_xz + uy * s_yz - 2.0f * uz * (v[0][0] + v[1][1]))};
+    const Row radial = qw * v_quat[0] + ux * v_quat[1] + uy * v_quat[2] + uz * v_quat[3];
+    for (int j = 0; j < 4; ++j) v_quat[j] = (v_quat[j] - unit[j] * radial) * inv_length;
+    const Row v_opacity = moments[0] / given[0];
+    write(reinterpret_cast<float*>(means_out.data + first), 3, v_mean);
+    write(reinterpret_cast<float*>(quats_out.data + first), 4, v_quat);
+    write(reinterpret_cast<float*>(scales_out.data + first), 3, v_scale);
+    write(opacities_out.data + first, 1, &v_opacity);
+    write(reinterpret_cast<float*>(means2d_out.data + first), 2, v_pixel);
+    if (poses_out.shape[0] > 0) {
+        Row pose[12];
+        for (int r = 0; r < 3; ++r) {
+            for (int j = 0; j < 3; ++j)
+                pose[3 * r + j] = v_point[r] * away[j] + v_axes[r][0] * R[j][0] + v_axes[r][1] * R[j][1]
+                                + v_axes[r][2] * R[j][2];
+            pose[9 + r] = v_point[r];
+        }
+        write(poses_out.data + first * 12, 12, pose);
+    }
+""".replace("    POINT\n", POINT)
+    .replace("    JACOBIAN\n", JACOBIAN)
+    .replace("    FACTOR\n", FACTOR)
+)
+
+CONSTANTS = {
+    "MIN_NORM2": f"{float(MIN_QUAT_NORM2)}f",
+    "UNIT": f"{float(UNIT)}f",
+    "LOG2_E": f"{float(LOG2_E)}f",
+    "LN_2": f"{float(LN_2)}f",
+    "SEEN": int(SEEN),
+    "VISIBLE": int(VISIBLE),
+    "NON_FINITE": int(NON_FINITE),
+    "TRANSPARENT": int(TRANSPARENT),
+    "OUTSIDE_DEPTH": int(OUTSIDE_DEPTH),
+    "OFF_SCREEN": int(OFF_SCREEN),
+    "DEGENERATE": int(DEGENERATE),
+}
+
+
+@wp.func_native(snippet(PROJECT, **CONSTANTS))
+def project_group(
+    group: int,
+    means: wp.array[wp.vec3],
+    quats: wp.array[wp.vec4],
+    scales: wp.array[wp.vec3],
+    opacities: wp.array[float],
+    camera: Pinhole,
+    knobs: Knobs,
+    splats_out: wp.array[Splat],
+    status_out: wp.array[wp.uint8],
+    depths_out: wp.array[float],
+): ...
+
+
+@wp.kernel
+def project_groups(
+    # In:
+    base: int,  # first group of 16 of this launch
+    means: wp.array[wp.vec3],  # [N] centres [m]
+    quats: wp.array[wp.vec4],  # [N] rotations (w, x, y, z)
+    scales: wp.array[wp.vec3],  # [N] standard deviations [m]
+    opacities: wp.array[float],  # [N]
+    camera: Pinhole,
+    knobs: Knobs,
+    # Out:
+    splats_out: wp.array[Splat],  # [N] valid where visible
+    status_out: wp.array[wp.uint8],  # [N] VISIBLE or why not
+    depths_out: wp.array[float],  # [N] z in the camera frame [m], where visible
+):
+    """Project 16 Gaussians (paper eq. 2, 3) and decide whether any pixel can see them."""
+    project_group(base + wp.tid(), means, quats, scales, opacities, camera, knobs, splats_out, status_out, depths_out)
+
+
+@wp.func_native(snippet(BACKWARD, **CONSTANTS))
+def project_group_backward(
+    group: int,
+    means: wp.array[wp.vec3],
+    quats: wp.array[wp.vec4],
+    scales: wp.array[wp.vec3],
+    opacities: wp.array[float],
+    camera: Pinhole,
+    knobs: Knobs,
+    sums: wp.array2d[float],
+    at_depth: int,
+    means_out: wp.array[wp.vec3],
+    quats_out: wp.array[wp.vec4],
+    scales_out: wp.array[wp.vec3],
+    opacities_out: wp.array[float],
+    means2d_out: wp.array[wp.vec2],
+    poses_out: wp.array2d[float],
+): ...
+
+
+@wp.kernel
+def project_groups_backward(
+    # In:
+    base: int,  # first group of 16 of this launch
+    means: wp.array[wp.vec3],  # [N] centres [m]
+    quats: wp.array[wp.vec4],  # [N] rotations (w, x, y, z)
+    scales: wp.array[wp.vec3],  # [N] standard deviations [m]
+    opacities: wp.array[float],  # [N]
+    camera: Pinhole,
+    knobs: Knobs,
+    sums: wp.array2d[float],  # [N, 16] as `project_backward` reads them
+    at_depth: int,  # column of `sums` with the gradient of the depth, -1 = none
+    # Out:
+    means_out: wp.array[wp.vec3],  # [N] zero where no tile was reached, as all that follow
+    quats_out: wp.array[wp.vec4],  # [N]
+    scales_out: wp.array[wp.vec3],  # [N]
+    opacities_out: wp.array[float],  # [N]
+    means2d_out: wp.array[wp.vec2],  # [N] gradient of the projected centres [1 / pixels]
+    poses_out: wp.array2d[float],  # [N, POSE_COLUMNS] each Gaussian's share of the pose's gradient, or empty
+):
+    """Differentiate `project_groups`."""
+    project_group_backward(
+        base + wp.tid(),
+        means,
+        quats,
+        scales,
+        opacities,
+        camera,
+        knobs,
+        sums,
+        at_depth,
+        means_out,
+        quats_out,
+        scales_out,
+        opacities_out,
+        means2d_out,
+        poses_out,
+    )

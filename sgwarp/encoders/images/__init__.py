@@ -1,0 +1,1 @@
+"""Image-level encoders: one vector for a whole image or crop."""

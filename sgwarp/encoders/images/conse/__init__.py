@@ -1,0 +1,1 @@
+"""ConSE: an ImageNet classifier and sentence embeddings, the encoder that works offline."""

@@ -1,0 +1,1 @@
+"""Instance-level encoders: boxes or masks with labels."""

@@ -1,0 +1,1 @@
+"""Feature maps and label images that other tools have written."""

@@ -1,0 +1,1 @@
+"""Mask generators, which cut an image into regions."""

@@ -1,0 +1,1 @@
+"""Pixel-level encoders: one vector per pixel."""

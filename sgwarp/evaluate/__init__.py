@@ -1,1 +1,0 @@
-"""Figures of merit: segmentation from one confusion matrix, localisation from hits."""

@@ -1,0 +1,1 @@
+"""Measured on data with ground truth."""

@@ -1,0 +1,1 @@
+"""Files as bytes: bounded reading, atomic writing, images. Nothing here knows a scene type."""

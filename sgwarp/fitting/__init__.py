@@ -1,1 +1,0 @@
-"""Parts of `sgwarp.fit`: photographs, starting points, the model, strategies, checkpoints, pictures."""

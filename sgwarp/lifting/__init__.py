@@ -1,0 +1,1 @@
+"""2D semantics into the Gaussians, without training (paper, Sec. III-B)."""

@@ -1,0 +1,1 @@
+"""The 3D semantic network (paper, Sec. III-C)."""

@@ -1,0 +1,1 @@
+"""Layers and networks on sparse voxels, with the conventions and parameter names of MinkowskiEngine."""

@@ -1,0 +1,134 @@
+"""Training scenes: pairs of a scene and its lifted semantics, and what one training step is given of them."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import torch
+from torch import Tensor
+
+from sgwarp.errors import InputError
+from sgwarp.network.augmentation import Augmentation
+from sgwarp.network.inputs import InputMode, voxelize
+from sgwarp.network.layers.sparse import SparseTensor
+from sgwarp.scene import Gaussians, Semantics
+
+CHUNK = 65536  # Gaussians whose features are widened at once
+
+
+@dataclass(frozen=True)
+class TrainingScene:
+    """A scene by name, read anew each time it is its turn: a data set need not fit into memory."""
+
+    name: str
+    load: Callable[[], tuple[Gaussians, Semantics]]
+    stamp: str = ""  # changes when the files do: a run is not resumed on other data
+    files: tuple[Path, ...] = ()
+
+
+def scenes_in(paths: Sequence[Path]) -> list[TrainingScene]:
+    """Scenes {name}.ply with what `sgwarp lift` wrote for them, {name}.safetensors, beside each.
+
+    Args:
+        paths: Scenes, or folders of them.
+
+    Raises:
+        InputError: A folder holds no scene, or a scene has no semantics beside it.
+    """
+    found: list[Path] = []
+    for path in paths:
+        inside = sorted(path.glob("*.ply")) if path.is_dir() else [path]
+        if not inside:
+            raise InputError(f"{path}: holds no scene .ply")
+        found += inside
+    return [_scene(path) for path in found]
+
+
+def _scene(path: Path) -> TrainingScene:
+    semantics = path.with_name(path.name.removesuffix(".ply").removesuffix(".compressed") + ".safetensors")
+    if not path.is_file():
+        raise InputError(f"{path}: no such file; check the path")
+    if not semantics.is_file():
+        raise InputError(f"{path}: has no {semantics.name} beside it; write one with `sgwarp lift`")
+
+    def load() -> tuple[Gaussians, Semantics]:
+        from sgwarp.io.scenes import load_gaussians
+        from sgwarp.io.store import load_semantics
+
+        gaussians = load_gaussians(path)
+        return gaussians, load_semantics(semantics, gaussians)
+
+    files = (path, semantics)
+    stamp = " ".join(f"{file.stat().st_size}:{file.stat().st_mtime_ns}" for file in files)
+    return TrainingScene(str(path), load, stamp, files)
+
+
+@dataclass(frozen=True, eq=False)
+class Example:
+    """One scene as a training step sees it.
+
+    Attributes:
+        voxels: Input of the network.
+        targets: Mean direction of the lifted features in each voxel that has some, unit vectors [T, C].
+        rows: Their voxels, int64 [T].
+        weights: Reliability of each target, or ones, [T].
+    """
+
+    voxels: SparseTensor
+    targets: Tensor
+    rows: Tensor
+    weights: Tensor
+
+
+def reliability(semantics: Semantics) -> Tensor:
+    """How far a lifted feature can be trusted, float32 [N] from 0 (not seen) to 1.
+
+    w / (w + median w) times v / (v + 1), with w its weight and v the views that share it: a single grazing pixel says
+    little, and one view alone may be wrong.
+    """
+    seen = semantics.seen
+    if not bool(seen.any()):
+        return torch.zeros_like(semantics.weight)
+    weight, views = semantics.weight, semantics.effective_views
+    return weight / (weight + weight[seen].median()) * views / (views + 1.0)
+
+
+def make_example(
+    gaussians: Gaussians,
+    semantics: Semantics,
+    inputs: InputMode,
+    voxel: float,
+    *,
+    augment: Augmentation | None = None,
+    generator: torch.Generator | None = None,
+    by_reliability: bool = False,
+) -> Example:
+    """Voxels of a scene, changed at random if asked for, and what the network should say about them.
+
+    Raises:
+        InputError: The semantics belong to another scene, or no Gaussian falls into a voxel.
+    """
+    semantics.require_scene(gaussians)
+    if augment is not None:
+        gaussians = augment(gaussians, voxel, generator or torch.Generator())
+    voxels, rows = voxelize(gaussians, inputs, voxel)
+    trust = reliability(semantics) if by_reliability else semantics.seen.to(torch.float32)
+    trust = torch.where(rows >= 0, trust.to(rows.device), 0.0)
+    known = (trust > 0).nonzero()[:, 0]
+    here = rows[known]
+    count = len(voxels.features)
+    sums = voxels.features.new_zeros(count, semantics.features.shape[1])
+    for start in range(0, len(known), CHUNK):
+        part = known[start : start + CHUNK]
+        features = semantics.features[part.to(semantics.features.device)].to(sums)
+        unusable = ~torch.isfinite(features).all(dim=1)
+        trust[part[unusable]] = 0.0
+        unit = torch.nn.functional.normalize(torch.where(unusable[:, None], 0.0, features), dim=1, eps=1e-20)
+        sums.index_add_(0, here[start : start + CHUNK], unit * trust[part][:, None])
+    weights = sums.new_zeros(count).index_add_(0, here, trust[known])
+    filled = (sums.square().sum(dim=1) > 0).nonzero()[:, 0]
+    targets = torch.nn.functional.normalize(sums[filled], dim=1, eps=1e-20)
+    mean_trust = weights[filled] / sums.new_zeros(count).index_add_(0, here, torch.ones_like(trust[known]))[filled]
+    return Example(voxels, targets, filled, mean_trust)

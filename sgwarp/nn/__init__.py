@@ -1,1 +1,0 @@
-"""Networks on sparse voxels, with the conventions and parameter names of MinkowskiEngine."""

@@ -1,0 +1,1 @@
+"""Float64 oracles of the operations. Only tests, benchmarks and the report import them."""

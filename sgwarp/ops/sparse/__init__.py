@@ -1,0 +1,1 @@
+"""Sparse voxels and convolutions on them."""

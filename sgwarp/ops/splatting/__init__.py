@@ -1,0 +1,1 @@
+"""Gaussians to pixels and back: the rasterizer, its gradients and its transpose."""

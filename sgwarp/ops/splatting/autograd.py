@@ -1,0 +1,259 @@
+"""Rendering with gradients: the rasterizer on plain tensors, for fitting scenes, features and camera poses."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from sgwarp.errors import InputError
+from sgwarp.ops.splatting import backward, forward, tiles
+from sgwarp.ops.splatting.forward import Rendering, composite_recorded, packed_colors, require_finite
+from sgwarp.ops.splatting.plan import RenderPlan, plan_render
+from sgwarp.ops.splatting.settings import RasterSettings
+from sgwarp.scene import SH_COUNTS, Camera, Gaussians
+
+
+def rasterize(
+    means: Tensor,
+    quats: Tensor,
+    scales: Tensor,
+    opacities: Tensor,
+    viewmat: Tensor,
+    K: Tensor,
+    width: int,
+    height: int,
+    *,
+    sh: Tensor | None = None,
+    features: Tensor | None = None,
+    background: Tensor | None = None,
+    means2d: Tensor | None = None,
+    absgrad: bool = False,
+    expected_depth: bool = False,
+    depth: bool = False,
+    near: float = 0.01,
+    far: float = 1e10,
+    settings: RasterSettings = RasterSettings(),  # noqa: B008 - frozen
+    schedule: str | None = None,
+    deterministic: bool | None = None,
+) -> Rendering:
+    """Render a view (paper eq. 1) with gradients to every tensor but K.
+
+    The same image as `sg.render`. Gaussians that are left out, among them all that are not finite, get gradients of
+    exactly zero. On the CPU gradients have the same bits for any number of threads.
+
+    Args:
+        means: Centres [m], float [N, 3].
+        quats: Rotations (w, x, y, z) of any length, float [N, 4].
+        scales: Standard deviations [m], float [N, 3].
+        opacities: In [0, 1], float [N].
+        viewmat: World to camera, OpenCV axes, rigid, float [4, 4]. Its gradient is that of the 12 free entries of
+            p = R m + t; project it onto rigid motions by parametrising them.
+        K: Intrinsics [pixels], [3, 3].
+        width, height: Image size [pixels].
+        sh: Spherical-harmonic coefficients, float [N, K, 3]; colours are composited.
+        features: Any other values to composite, float [N, C]; exactly one of `sh` and `features` is given.
+        background: Seen through what is left transparent, float [C]; None is zero.
+        means2d: float [N, 2], added to the projected centres as far as gradients go: its values are not read, and its
+            gradient is that of the projected centres [1 / pixels], which densification looks at.
+        absgrad: Also add the sum over pixels of the magnitude of each one's gradient to `means2d.absgrad` (AbsGS).
+        expected_depth, depth: Which depths to render, as in `sg.render`; both have gradients.
+        near, far: Range of depth that is rendered [m].
+        settings: The approximations.
+        schedule: "lanes" or "block", by default the device's own; either runs on the CPU.
+        deterministic: Add gradients up in a fixed order. The CPU always does; on CUDA the default is atomic additions.
+
+    Raises:
+        InputError: Shapes do not fit, or the camera is not valid; on the CPU also: a scale is negative or an opacity
+            outside [0, 1].
+    """
+    if (sh is None) == (features is None):
+        raise InputError("give exactly one of sh [N, K, 3] and features [N, C]")
+    if means2d is not None and tuple(means2d.shape) != (len(means), 2):
+        raise InputError(f"means2d: expected shape [{len(means)}, 2], got {list(means2d.shape)}")
+    if absgrad and means2d is None:
+        raise InputError("absgrad: give means2d, whose attribute absgrad receives it")
+    values = sh if features is None else features
+    assert values is not None
+    n = len(means)
+    if schedule not in (None, "lanes", "block"):
+        raise InputError(f"schedule: expected 'lanes', 'block' or None, got '{schedule}'")
+    if features is not None:
+        if not (features.ndim == 2 and len(features) == n and features.shape[1] > 0 and features.is_floating_point()):
+            raise InputError(f"features: expected floating point [{n}, C], got {features.dtype} {list(features.shape)}")
+        require_finite(features)
+    if sh is not None and not (sh.ndim == 3 and sh.shape[1] in SH_COUNTS):
+        raise InputError(f"sh: expected shape [{n}, 1, 4, 9 or 16, 3], got {list(sh.shape)}")
+    channels = 3 if features is None else features.shape[1]
+    if background is not None and tuple(background.shape) != (channels,):
+        raise InputError(f"background: expected shape [{channels}], got {list(background.shape)}")
+
+    _check_fields(means, quats, scales, opacities)
+    camera = Camera(K, viewmat, width, height, near, far)
+    inputs = (means, quats, scales, opacities, values, viewmat, means2d, background)
+    if not (torch.is_grad_enabled() and any(t is not None and t.requires_grad for t in inputs)):
+        colors = means.new_zeros(n, 1, 3) if sh is None else sh
+        gaussians = Gaussians(means, quats, scales, opacities, colors)
+        return forward.rasterize(
+            gaussians,
+            camera,
+            features,
+            background=background,
+            expected_depth=expected_depth,
+            depth=depth,
+            settings=settings,
+        )
+    receives_absgrad = means2d if absgrad else None
+    plan = plan_render(
+        Gaussians.unchecked(means, quats, scales, opacities, means.new_zeros(n, 1, 3) if sh is None else sh),
+        "colors" if features is None else "features",
+        channels=channels,
+        depth=expected_depth or depth,
+        record=True,
+        settings=settings,
+        look=False,
+    )
+    request = _Request(camera, settings, plan, receives_absgrad, schedule, deterministic)
+    means, quats, scales, opacities, values = (
+        t.to(torch.float32).contiguous() for t in (means, quats, scales, opacities, values)
+    )
+    image, transmittance, depth_sum, surface = _Rasterize.apply(
+        means, quats, scales, opacities, values, viewmat, means2d, request
+    )
+    if background is not None:
+        image = image + transmittance[..., None] * background.to(image)
+    alpha = 1.0 - transmittance
+    mean_depth = None
+    if expected_depth:
+        mean_depth = torch.where(alpha > 0, depth_sum / alpha.clamp(min=1e-12), 0.0)
+    return Rendering(image, alpha, mean_depth, surface if depth else None, request.status_counts)
+
+
+def _check_fields(means: Tensor, quats: Tensor, scales: Tensor, opacities: Tensor) -> None:
+    """Shapes and types always; values on the CPU only, since on CUDA to look at them is to wait for the device."""
+    n = len(means)
+    fields = {"means": (means, (n, 3)), "quats": (quats, (n, 4)), "scales": (scales, (n, 3))}
+    for name, (tensor, shape) in (fields | {"opacities": (opacities, (n,))}).items():
+        if tuple(tensor.shape) != shape or not tensor.is_floating_point():
+            got = f"{tensor.dtype} {list(tensor.shape)}"
+            raise InputError(f"{name}: expected floating point {list(shape)}, got {got}")
+    if n == 0 or means.is_cuda:
+        return
+    with torch.no_grad():
+        lowest, highest = opacities.aminmax()
+        if not (scales.min() >= 0 and lowest >= 0 and highest <= 1):  # or NaN, which is no error
+            Gaussians(means, quats, scales, opacities, means.new_zeros(n, 1, 3))
+
+
+@dataclass(eq=False)
+class _Request:
+    """What is no tensor, and what comes back beside the images."""
+
+    camera: Camera
+    settings: RasterSettings
+    plan: RenderPlan
+    receives_absgrad: Tensor | None
+    schedule: str | None
+    deterministic: bool | None
+    status_counts: Tensor = field(default_factory=lambda: torch.empty(0, dtype=torch.int64))
+
+    @property
+    def harmonics(self) -> bool:
+        """Whether the values are coefficients."""
+        return self.plan.values == "colors"
+
+
+class _Rasterize(torch.autograd.Function):
+    """Project, bin and composite; the backward pass replays the tile lists, which are kept until then."""
+
+    @staticmethod
+    def forward(
+        ctx: Any,
+        means: Tensor,
+        quats: Tensor,
+        scales: Tensor,
+        opacities: Tensor,
+        values: Tensor,
+        viewmat: Tensor,
+        means2d: Tensor | None,
+        request: _Request,
+    ) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+        camera, settings = request.camera, request.settings
+        gaussians = _gaussians(means, quats, scales, opacities, values, request)
+        features = None if request.harmonics else values
+        projected = tiles.project(gaussians, camera, settings)
+        order = tiles.depth_order(projected)
+        colors = packed_colors(gaussians, camera, features, order, request.plan)
+        lists = tiles.bin_splats(projected, order, colors, camera, places=True, keep=True)
+        image, transmittance, depth_sum, surface, last, hit = composite_recorded(
+            lists, camera, settings, features, request.plan.depth, request.schedule
+        )
+        request.status_counts = projected.counts()
+        recorded = (transmittance, last, hit)
+        ctx.save_for_backward(means, quats, scales, opacities, values, viewmat, *recorded, *vars(lists).values())
+        ctx.request = request
+        ctx.channels = image.shape[2]
+        ctx.set_materialize_grads(False)
+        return image, transmittance, depth_sum, surface
+
+    @staticmethod
+    @torch.autograd.function.once_differentiable
+    def backward(
+        ctx: Any,
+        v_image: Tensor | None,
+        v_transmittance: Tensor | None,
+        v_depth_sum: Tensor | None,
+        v_surface: Tensor | None,
+    ) -> tuple[Tensor | None, ...]:
+        request: _Request = ctx.request
+        camera, settings = request.camera, request.settings
+        means, quats, scales, opacities, values, viewmat, *kept = ctx.saved_tensors
+        gaussians = _gaussians(means, quats, scales, opacities, values, request)
+        recorded, lists = (kept[0], kept[1], kept[2]), tiles.TileLists(*kept[3:])
+        splats = backward.composite_backward(
+            lists,
+            camera,
+            settings,
+            None if request.harmonics else values,
+            ctx.channels,
+            recorded,
+            backward.ImageGradients(v_image, v_transmittance, v_depth_sum, v_surface),
+            len(means),
+            absolute=request.receives_absgrad is not None,
+            schedule=request.schedule,
+            deterministic=request.deterministic,
+        )
+        pose = ctx.needs_input_grad[5]
+        result = backward.project_backward(gaussians, camera, settings, splats, pose=pose)
+        v_values, v_offsets = splats.features, None
+        if request.harmonics:
+            degree = request.plan.sh_degree
+            v_values, v_offsets = backward.shade_backward(gaussians, camera, splats, result.means, degree, pose=pose)
+        v_viewmat = backward.pose_gradient(camera, result.poses, v_offsets).to(viewmat) if pose else None
+        if request.receives_absgrad is not None:
+            _accumulate(request.receives_absgrad, splats.absolute)
+        return (
+            result.means,
+            result.quats,
+            result.scales,
+            result.opacities,
+            v_values,
+            v_viewmat,
+            result.means2d if ctx.needs_input_grad[6] else None,
+            None,
+        )
+
+
+def _gaussians(
+    means: Tensor, quats: Tensor, scales: Tensor, opacities: Tensor, values: Tensor, request: _Request
+) -> Gaussians:
+    sh = values if request.harmonics else means.new_zeros(len(means), 1, 3)
+    return Gaussians.unchecked(*(t.detach() for t in (means, quats, scales, opacities, sh)))
+
+
+def _accumulate(tensor: Tensor, absolute: Tensor | None) -> None:
+    """Add to `tensor.absgrad`, as autograd adds to `tensor.grad`."""
+    before = getattr(tensor, "absgrad", None)
+    tensor.absgrad = absolute if before is None or absolute is None else before + absolute  # type: ignore[attr-defined]

@@ -1,0 +1,301 @@
+"""The rasterizer's backward pass, stage by stage: images -> splats -> Gaussians, colours, pose."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import torch
+import warp as wp
+from torch import Tensor
+from torch.nn.functional import pad
+
+from sgwarp.kernels.compositing import block_backward as compositing_block_backward
+from sgwarp.kernels.compositing import lanes_backward as compositing_lanes_backward
+from sgwarp.kernels.compositing.lanes_backward import MOMENTS, row_columns
+from sgwarp.kernels.harmonics import backward as harmonics_backward
+from sgwarp.kernels.lifting.shared import sum_rows
+from sgwarp.kernels.projection import backward as kernels
+from sgwarp.kernels.projection import lanes as projection_lanes
+from sgwarp.kernels.transmittance import LaneIds, Lanes
+from sgwarp.ops.launcher import fresh, get_threads, launch, launch_blocks, scratch, view
+from sgwarp.ops.splatting import tiles
+from sgwarp.ops.splatting.forward import LANE, TILE_ROWS, in_slices, lane_scratch, runs_in_blocks
+from sgwarp.ops.splatting.lifting import LiftSums, add_weighted
+from sgwarp.ops.splatting.settings import RasterSettings
+from sgwarp.scene import Camera, FeatureMap, Gaussians
+
+TOGETHER = 4  # slices of 16 channels up to which the features' gradient comes with the geometry's
+GROUPS = 1024  # partial sums of the pose's gradient
+
+
+@dataclass(frozen=True, eq=False)
+class ImageGradients:
+    """Gradient of the loss with respect to what compositing returns; None is zero.
+
+    Attributes:
+        features: float32 [H, W, C].
+        transmittance: float32 [H, W].
+        depth_sum: Of sum alpha T z, float32 [H, W].
+        surface: Of the surface depth, float32 [H, W].
+    """
+
+    features: Tensor | None = None
+    transmittance: Tensor | None = None
+    depth_sum: Tensor | None = None
+    surface: Tensor | None = None
+
+
+@dataclass(frozen=True, eq=False)
+class SplatGradients:
+    """What compositing passes back to the splats; rows of Gaussians that reached no tile are zero.
+
+    Attributes:
+        sums: Moments of g under 1, u, v, u^2, u v, v^2 (see kernels/projection_backward.py), then others, [N, 16].
+        at_depth: Column of `sums` with the gradient of the depth, -1 if there is none.
+        features: Gradient of the composited features, [N, C].
+        absolute: Sum over the pixels of the magnitude of each one's gradient of the projected centre, [N, 2]; or None.
+    """
+
+    sums: Tensor
+    at_depth: int
+    features: Tensor
+    absolute: Tensor | None
+
+
+@dataclass(frozen=True, eq=False)
+class GaussianGradients:
+    """Gradients with respect to what projection reads, float32 [N, ...]; `poses` [N, 12] is empty unless asked for."""
+
+    means: Tensor
+    quats: Tensor
+    scales: Tensor
+    opacities: Tensor
+    means2d: Tensor
+    poses: Tensor
+
+
+def composite_backward(
+    lists: tiles.TileLists,
+    camera: Camera,
+    settings: RasterSettings,
+    features: Tensor | None,
+    channels: int,
+    recorded: tuple[Tensor, Tensor, Tensor],
+    gradients: ImageGradients,
+    count: int,
+    *,
+    absolute: bool = False,
+    schedule: str | None = None,
+    deterministic: bool | None = None,
+) -> SplatGradients:
+    """Differentiate `composite_recorded`.
+
+    Args:
+        lists: Kept tile lists of the view, with places.
+        features: What was composited if it did not travel with the splats, [N, C].
+        channels: Of the image.
+        recorded: Transmittance, `last` and `hit` as compositing returned them.
+        gradients: Of the loss.
+        count: N.
+        absolute: Also sum magnitudes.
+        schedule: "lanes" or "block", by default the device's own.
+        deterministic: Add up in a fixed order. The CPU always does; on CUDA the default is atomic additions.
+    """
+    device = lists.order.device
+    block = runs_in_blocks(device, schedule)
+    ordered = not block or (device.type == "cpu" if deterministic is None else deterministic)
+    transmittance, last, hit = recorded
+    wide = channels > 3
+    zeros = torch.zeros_like(transmittance)
+    v_image = zeros[..., None].expand(-1, -1, channels) if gradients.features is None else gradients.features
+    v_transmittance = zeros if gradients.transmittance is None else gradients.transmittance
+    v_depth = zeros if gradients.depth_sum is None else gradients.depth_sum
+    depth = gradients.depth_sum is not None or gradients.surface is not None
+    at_depth, at_absolute, _ = row_columns(wide, depth, absolute)
+    sums = torch.zeros(count, LANE, device=device)
+    rows = scratch("backward rows", lists.intersections * LANE if ordered else 0, torch.float32, device).view(-1, LANE)
+    slices = in_slices(features if wide and features is not None else zeros[:1, :1])
+    together = wide and not block and slices.shape[1] <= TOGETHER
+    shape = (lists.intersections, slices.shape[1], LANE) if together else (0, 0, LANE)
+    feature_rows = scratch("feature rows", math.prod(shape), torch.float32, device).view(shape)
+    head = lists.arrays()
+    size = [tiles.knobs(settings), camera.width, camera.height]
+    if block:
+        maps = [view(t.contiguous(), wp.float32) for t in (transmittance, v_transmittance, v_image, v_depth)]
+        inputs = [*head, view(slices, Lanes), *maps, view(last, wp.int32), *size]
+        kernel = compositing_block_backward.make_composite_backward_block(wide, depth, absolute, ordered)
+        outputs = [view(rows if ordered else sums, wp.float32)]
+        launch_blocks(kernel, [lists.tile_count], inputs, outputs, device=device)
+    else:
+        columns = -(-camera.width // LANE)
+        pixels = in_slices(v_image if wide else zeros[:0, :0, None])
+        if wide:
+            gradient = lane_scratch("backward gradient", TILE_ROWS, slices.shape[1] * LANE, device)
+        else:
+            by_row = scratch("backward gradient", camera.height * columns * 3 * LANE, torch.float32, device)
+            by_row = by_row.view(camera.height, columns, 3, LANE)
+            _channels_in_lanes(v_image, by_row)
+            gradient = view(by_row, Lanes)
+        maps = [view(_in_lanes(transmittance, 1.0), Lanes), view(_in_lanes(v_transmittance, 0.0), Lanes)]
+        maps += [view(_in_lanes(last, -1), LaneIds), gradient, view(pixels, Lanes)]
+        maps += [view(_in_lanes(v_depth if depth else zeros[:0], 0.0), Lanes)]
+        scratches = [
+            lane_scratch("backward state", TILE_ROWS, 2, device),
+            view(scratch("reach", get_threads() * TILE_ROWS, torch.int32, device).view(-1, TILE_ROWS), wp.int32),
+        ]
+        inputs = [*head, view(slices.unsqueeze(2), Lanes), *maps, *size]
+        kernel = compositing_lanes_backward.make_composite_backward(wide, depth, absolute)
+        outputs = [view(rows, Lanes), view(feature_rows, Lanes)]
+        launch(kernel, lists.tile_count, [*inputs, *scratches], outputs, device=device, slots=True)
+    if ordered:
+        inputs = [*lists.sums(), view(rows, Lanes)]
+        launch(kernels.sum_intersections, len(lists.order), inputs, [view(sums, Lanes)], device=device)
+    if gradients.surface is not None and count:
+        # Pixels without a surface add zero to the first Gaussian: choosing the others would wait for the device.
+        at_hit = torch.where(hit >= 0, gradients.surface, 0.0).flatten()
+        sums[:, at_depth].index_add_(0, hit.clamp(min=0).flatten().to(torch.int64), at_hit)
+    if not wide:
+        v_features = sums[:, MOMENTS : MOMENTS + channels]
+    elif together:
+        totals = torch.zeros(count, *slices.shape[1:], device=device)
+        inputs = [*lists.sums(), view(feature_rows, Lanes), 0, slices.shape[1]]
+        launch(sum_rows, len(lists.order), inputs, [view(totals, Lanes)], device=device)
+        v_features = totals.flatten(1)[:, :channels]
+    else:
+        v_features = _lift_gradient(lists, camera, v_image, settings, count, block, ordered)
+    # The kernel leaves out the factor of d(2^x) = ln 2 2^x dx, and that of the square.
+    magnitudes = 2.0 * kernels.LN_2 * sums[:, at_absolute : at_absolute + 2] if absolute else None
+    return SplatGradients(sums, at_depth if depth else -1, v_features, magnitudes)
+
+
+def _in_lanes(image: Tensor, outside: float) -> Tensor:
+    """An image [H, W] with 16 pixels of a row in a vector, [H, tile columns, 16]; beyond its edge it is `outside`."""
+    return pad(image, (0, -image.shape[1] % LANE), value=outside).contiguous().unflatten(1, (-1, LANE))
+
+
+def _channels_in_lanes(image: Tensor, out: Tensor) -> None:
+    """Write an image [H, W, C] to `out` [H, tile columns, C or more, 16]; the rest becomes zero."""
+    _, columns, channels, _ = out.shape
+    height, width, given = image.shape
+    if (given, width) != (channels, columns * LANE):
+        image = pad(image, (0, channels - given, 0, columns * LANE - width))
+    out.copy_(image.reshape(height, columns, LANE, channels).transpose(2, 3))
+
+
+def _lift_gradient(
+    lists: tiles.TileLists,
+    camera: Camera,
+    v_image: Tensor,
+    settings: RasterSettings,
+    count: int,
+    block: bool,
+    ordered: bool,
+) -> Tensor:
+    """Gradient of the features: the image is A x, so it is A^T v, the image's gradient lifted onto the Gaussians."""
+    sums = LiftSums.zeros(count, v_image.shape[2], v_image.device)
+    feature_map = FeatureMap(space="gradient", dense=v_image.contiguous())
+    add_weighted(lists, camera, feature_map, sums, settings, block=block, ordered=ordered)
+    return sums.features
+
+
+def project_backward(
+    gaussians: Gaussians,
+    camera: Camera,
+    settings: RasterSettings,
+    splats: SplatGradients,
+    *,
+    pose: bool = False,
+) -> GaussianGradients:
+    """Differentiate `tiles.project`; `pose` asks for each Gaussian's share of the pose's gradient."""
+    n, device = len(gaussians), gaussians.device
+    means, quats, scales, opacities, means2d, poses = (
+        torch.empty(*shape, device=device)
+        for shape in ((n, 3), (n, 4), (n, 3), (n,), (n, 2), (n if pose else 0, kernels.POSE_COLUMNS))
+    )
+    result = GaussianGradients(means, quats, scales, opacities, means2d, poses)
+    inputs = [
+        view(gaussians.means, wp.vec3),
+        view(gaussians.quats, wp.vec4),
+        view(gaussians.scales, wp.vec3),
+        view(gaussians.opacities, wp.float32),
+        tiles.pinhole(camera),
+        tiles.knobs(settings),
+        view(splats.sums, wp.float32),
+        splats.at_depth,
+    ]
+    outputs = [
+        view(result.means, wp.vec3),
+        view(result.quats, wp.vec4),
+        view(result.scales, wp.vec3),
+        view(result.opacities, wp.float32),
+        view(result.means2d, wp.vec2),
+        view(result.poses, wp.float32),
+    ]
+    if device.type == "cuda":
+        launch(kernels.project_backward, n, inputs, outputs, device=device)
+    else:
+        groups = -(-n // projection_lanes.GROUP)
+        launch(projection_lanes.project_groups_backward, groups, inputs, outputs, device=device)
+    return result
+
+
+def shade_backward(
+    gaussians: Gaussians,
+    camera: Camera,
+    splats: SplatGradients,
+    v_means: Tensor,
+    degree: int,
+    *,
+    pose: bool = False,
+) -> tuple[Tensor, Tensor]:
+    """Differentiate `tiles.shade`; `v_means` is added to.
+
+    Returns:
+        Gradient of the coefficients, [N, K, 3], and of each centre seen from the camera's, [N, 3] or, unless `pose`,
+        empty.
+    """
+    n, device = len(gaussians), gaussians.device
+    v_sh = fresh(*gaussians.sh.shape, device=device)
+    v_offsets = torch.empty(n if pose else 0, 3, device=device)
+    inputs = [
+        view(gaussians.means, wp.vec3),
+        view(gaussians.sh, wp.vec3),
+        degree,
+        tiles.pinhole(camera),
+        view(splats.sums, wp.float32),
+        MOMENTS,
+    ]
+    outputs = [view(v_sh, wp.vec3), view(v_means, wp.vec3), view(v_offsets, wp.float32)]
+    launch(harmonics_backward.harmonics_backward, n, inputs, outputs, device=device)
+    return v_sh, v_offsets
+
+
+def pose_gradient(camera: Camera, poses: Tensor, v_offsets: Tensor | None) -> Tensor:
+    """Gradient of the world-to-camera matrix, float64 [4, 4], from every Gaussian's share.
+
+    Args:
+        poses: Of the rotation about the camera's centre and of the translation, [N, 12].
+        v_offsets: Of each centre seen from the camera's, [N, 3], where colours depend on the direction.
+    """
+    total = _sum_rows(poses)
+    v_translation = total[9:]
+    pose, center = camera.world_to_camera.to(poses.device), camera.position.to(poses.device)
+    gradient = torch.zeros(4, 4, dtype=torch.float64, device=poses.device)
+    # p = R m + t, and m = (m - center) + center.
+    gradient[:3, :3] = total[:9].view(3, 3) + torch.outer(v_translation, center)
+    gradient[:3, 3] = v_translation
+    if v_offsets is not None:
+        v_center = -_sum_rows(v_offsets)
+        gradient[:3, :3] -= torch.outer(pose[:3, 3], v_center)
+        gradient[:3, 3] -= pose[:3, :3] @ v_center
+    return gradient
+
+
+def _sum_rows(rows: Tensor) -> Tensor:
+    """Column sums in double precision, the same bits for any number of threads, float64 [Q]."""
+    per_group = max(1, -(-len(rows) // GROUPS))
+    partial = torch.zeros(GROUPS, rows.shape[1], dtype=torch.float64, device=rows.device)
+    inputs = [view(rows, wp.float32), per_group]
+    launch(kernels.sum_groups, GROUPS, inputs, [view(partial, wp.float64)], device=rows.device)
+    return partial.sum(dim=0)

@@ -1,0 +1,306 @@
+"""Projection and tile lists of one view: what compositing and lifting both start from."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import torch
+import warp as wp
+from torch import Tensor
+
+from sgwarp.errors import InputError
+from sgwarp.kernels import binning
+from sgwarp.kernels.gaussian import Pinhole, Splat
+from sgwarp.kernels.harmonics import forward as harmonics
+from sgwarp.kernels.projection import forward as projection
+from sgwarp.kernels.projection import lanes as projection_lanes
+from sgwarp.ops.launcher import launch, launch_plain, scratch, view
+from sgwarp.ops.splatting.settings import RasterSettings
+from sgwarp.scene import Camera, Gaussians
+
+TILE = 16
+SLICES = 16  # of the depth order, counted and filled independently; not the number of threads
+MAX_INTERSECTIONS = 2**31 - 1
+
+
+@dataclass(frozen=True)
+class Projected:
+    """Splats of one view; the arrays are scratch, valid until the next view."""
+
+    splats: wp.array  # Splat [N]
+    status: Tensor  # uint8 [N], see kernels/projection.py
+    depths: Tensor  # float32 [N] z [m], valid where visible
+
+    def counts(self) -> Tensor:
+        """How many Gaussians have each status, int64; on CUDA nobody waits for it until it is read."""
+        if self.status.device.type == "cuda":
+            names = torch.arange(len(projection.STATUS_NAMES), device=self.status.device)
+            return (self.status[:, None] == names).sum(dim=0)
+        return torch.bincount(self.status, minlength=len(projection.STATUS_NAMES))
+
+
+def culled(counts: Tensor) -> dict[str, int]:
+    """How many Gaussians were left out, by reason, from `Projected.counts`."""
+    named = dict(zip(projection.STATUS_NAMES, counts.tolist(), strict=True))
+    return {name: count for name, count in named.items() if count and name != "visible"}
+
+
+@dataclass(frozen=True)
+class TileLists:
+    """Which splats each tile of one view composites; scratch, valid until the next view, unless they were kept.
+
+    A place is a position in the lists, an entry an intersection (one splat in one tile) counted splat by splat, a rank
+    a place in the depth order.
+    """
+
+    order: Tensor  # int32 [V] Gaussians by (depth, index)
+    memory: Tensor  # int32, flat: the splats in depth order
+    offsets: Tensor  # int32 [tiles + 1] first place of each tile
+    listed: Tensor  # int32 [I] ranks, tile by tile, front to back
+    entries: Tensor  # int32 [V + 1] first entry of each rank
+    places: Tensor  # int32 [I] place of each entry; empty unless asked for
+    tiles: Tensor  # int32 [I] tile of each entry; empty unless asked for
+
+    @property
+    def tile_count(self) -> int:
+        return len(self.offsets) - 1
+
+    @property
+    def intersections(self) -> int:
+        return len(self.listed)
+
+    @property
+    def splats(self) -> wp.array:
+        """The splats in depth order, Splat [V]; a view of `memory`."""
+        return as_splats(self.memory)
+
+    def arrays(self) -> list[wp.array]:
+        """What compositing and lifting kernels read: offsets, listed, splats."""
+        return [view(self.offsets, wp.int32), view(self.listed, wp.int32), self.splats]
+
+    def sums(self) -> list[wp.array]:
+        """What kernels read that add up the rows of each Gaussian: order, entries, places."""
+        return [view(t, wp.int32) for t in (self.order, self.entries, self.places)]
+
+
+SPLAT_WORDS = wp.types.type_size_in_bytes(Splat) // 4
+
+
+def splat_memory(count: int, device: torch.device, name: str | None) -> Tensor:
+    """Room for `count` splats, int32, flat: scratch of that name, or memory of its own."""
+    if name is None:
+        return torch.empty(count * SPLAT_WORDS, dtype=torch.int32, device=device)
+    return scratch(name, count * SPLAT_WORDS, torch.int32, device)
+
+
+def as_splats(memory: Tensor) -> wp.array:
+    """The memory as an array of splats; it must outlive the array."""
+    count = len(memory) // SPLAT_WORDS
+    layout = {"dtype": Splat, "shape": (count,), "capacity": 4 * len(memory)}
+    splats: wp.array = wp.array(ptr=memory.data_ptr(), device=wp.device_from_torch(memory.device), **layout)
+    return splats
+
+
+def pinhole(camera: Camera) -> Pinhole:
+    """The camera as the kernels read it."""
+    fx, fy, cx, cy = (camera.K[i, j].item() for i, j in ((0, 0), (1, 1), (0, 2), (1, 2)))
+    center = camera.position
+    rounded = center.to(torch.float32)
+    device = Pinhole()
+    device.rotation = wp.mat33(*camera.world_to_camera[:3, :3].flatten().tolist())
+    device.center = wp.vec3(*rounded.tolist())
+    device.center_rest = wp.vec3(*(center - rounded.to(torch.float64)).tolist())
+    device.focal = wp.vec2(fx, fy)
+    device.principal = wp.vec2(cx, cy)
+    # gsplat's clamp: 0.3 half fields of view beyond the image's borders, wherever the principal point lies.
+    margin_x, margin_y = 0.15 * camera.width / fx, 0.15 * camera.height / fy
+    device.tangent_min = wp.vec2(-cx / fx - margin_x, -cy / fy - margin_y)
+    device.tangent_max = wp.vec2((camera.width - cx) / fx + margin_x, (camera.height - cy) / fy + margin_y)
+    device.width, device.height = camera.width, camera.height
+    device.near, device.far = camera.near, camera.far
+    return device
+
+
+def knobs(settings: RasterSettings) -> projection.Knobs:
+    """The settings as the kernels read them."""
+    device = projection.Knobs()
+    device.alpha_min = settings.alpha_min
+    device.alpha_max = settings.alpha_max
+    device.transmittance_min = settings.transmittance_min
+    device.dilation = settings.dilation
+    device.antialiased = int(settings.antialiased)
+    device.surface_transmittance = 1.0 - settings.surface_opacity
+    device.alpha_min_level = math.log2(settings.alpha_min)
+    return device
+
+
+def project(gaussians: Gaussians, camera: Camera, settings: RasterSettings) -> Projected:
+    """Project every Gaussian."""
+    n, device = len(gaussians), gaussians.device
+    splats = as_splats(splat_memory(n, device, "splats"))
+    status = scratch("status", n, torch.uint8, device)
+    depths = scratch("depths", n, torch.float32, device)
+    inputs = [
+        view(gaussians.means, wp.vec3),
+        view(gaussians.quats, wp.vec4),
+        view(gaussians.scales, wp.vec3),
+        view(gaussians.opacities, wp.float32),
+        pinhole(camera),
+        knobs(settings),
+    ]
+    outputs = [splats, view(status, wp.uint8), view(depths, wp.float32)]
+    if device.type == "cuda":
+        launch(projection.project_gaussians, n, inputs, outputs, device=device)
+    else:
+        launch(projection_lanes.project_groups, -(-n // projection_lanes.GROUP), inputs, outputs, device=device)
+    # The kernel reads geometry and opacity only. On CUDA it is cheaper to look at all than to wait for the answer.
+    if device.type == "cuda" or gaussians.colors_may_be_non_finite:
+        status.masked_fill_(~gaussians.finite, int(projection.NON_FINITE))
+    return Projected(splats, status, depths)
+
+
+def depth_order(projected: Projected) -> Tensor:
+    """Visible Gaussians by (depth, index), int32 [V]; on CUDA all N, the culled last, so that nobody waits for V."""
+    device = projected.status.device
+    if device.type == "cuda":
+        shown = torch.where(projected.status == projection.VISIBLE, projected.depths, math.inf)
+        return shown.argsort(stable=True).to(torch.int32)
+    visible = (projected.status == projection.VISIBLE).nonzero().flatten().to(torch.int32)
+    count = len(visible)
+    keys = scratch("depth keys", 2 * count, torch.float32, device)
+    order = scratch("order", 2 * count, torch.int32, device)
+    torch.index_select(projected.depths, 0, visible, out=keys[:count])
+    order[:count] = visible
+    if count:
+        wp.utils.radix_sort_pairs(view(keys, wp.float32), view(order, wp.int32), count)
+    return order[:count]
+
+
+def shade(gaussians: Gaussians, camera: Camera, order: Tensor, degree: int) -> Tensor:
+    """Colours of the visible Gaussians seen from the camera, in depth order, float32 [V, 3]; degree 0 to 3."""
+    colors = scratch("colors", 3 * len(order), torch.float32, gaussians.device).view(-1, 3)
+    inputs = [
+        view(order, wp.int32),
+        view(gaussians.means, wp.vec3),
+        view(gaussians.sh, wp.vec3),
+        degree,
+        pinhole(camera),
+    ]
+    launch(harmonics.evaluate_harmonics, len(order), inputs, [view(colors, wp.vec3)], device=gaussians.device)
+    return colors
+
+
+def _first_places(counts: Tensor) -> tuple[Tensor, int]:
+    """Exclusive prefix sum with the total at the end, int32 [n + 1], and the total."""
+    places = torch.zeros(len(counts) + 1, dtype=torch.int64, device=counts.device)
+    torch.cumsum(counts, 0, out=places[1:])
+    total = int(places[-1])  # the one host synchronisation of the render path on CUDA: it sizes the lists
+    if total > MAX_INTERSECTIONS:
+        raise InputError(f"{total} tile intersections exceed 2^31 - 1; render at a lower resolution or fewer Gaussians")
+    return places.to(torch.int32), total
+
+
+def bin_splats(
+    projected: Projected,
+    order: Tensor,
+    colors: Tensor | None,
+    camera: Camera,
+    *,
+    places: bool = False,
+    tiles: bool = False,
+    keep: bool = False,
+) -> TileLists:
+    """Write the tile lists of a view.
+
+    `colors` [V, 3] travel with the splats; `places` and `tiles` of the entries are filled only if asked for. With
+    `keep` the lists have memory of their own: they outlive the view, as a backward pass needs it.
+    """
+    device = order.device
+    packed = view(colors, wp.vec3) if colors is not None else wp.empty(0, dtype=wp.vec3, device=str(device))
+    memory = splat_memory(len(order), device, None if keep else "ordered splats")
+    order = order.clone() if keep else order
+    count = bin_by_sorting if device.type == "cuda" else bin_by_counting
+    return count(projected, order, packed, camera, memory, places=places, tiles=tiles, keep=keep)
+
+
+def bin_by_counting(
+    projected: Projected,
+    order: Tensor,
+    colors: wp.array,
+    camera: Camera,
+    memory: Tensor,
+    *,
+    places: bool,
+    tiles: bool,
+    keep: bool,
+) -> TileLists:
+    """Count and fill in slices of the depth order (CPU)."""
+    device, count, grid = order.device, len(order), _tile_count(camera)
+    per_slice = max(1, -(-count // SLICES))
+    tile_counts = scratch("tile counts", SLICES * grid, torch.int32, device).view(SLICES, grid).zero_()
+    splat_counts = scratch("splat counts", count, torch.int32, device)
+    sizes = [per_slice, camera.width, camera.height]
+    splats = as_splats(memory)
+    inputs = [view(order, wp.int32), projected.splats, colors, *sizes]
+    spans = view(scratch("spans", count, torch.int64, device), wp.uint64)
+    outputs = [splats, view(tile_counts, wp.int32), view(splat_counts, wp.int32), spans]
+    launch(binning.count_tiles, SLICES, inputs, outputs, device=device, chunk=1)
+    entries, total = _first_places(splat_counts)
+    # Tile by tile, and within a tile slice by slice, so that each slice continues where the one in front ended.
+    by_tile = tile_counts.t().reshape(-1)
+    cursors = (by_tile.cumsum(0, dtype=torch.int32) - by_tile).view(grid, SLICES).t().contiguous()
+    offsets = torch.cat([cursors[0], entries[-1:]])
+    listed, places_of, tiles_of = (
+        _intersections(name, total if wanted else 0, device, keep)
+        for name, wanted in (("listed", True), ("places", places), ("tiles", tiles))
+    )
+    outputs = [view(t, wp.int32) for t in (cursors, listed, places_of, tiles_of)]
+    launch(
+        binning.fill_tiles, SLICES, [splats, *sizes, view(entries, wp.int32), spans], outputs, device=device, chunk=1
+    )
+    return TileLists(order, memory, offsets, listed, entries, places_of, tiles_of)
+
+
+def bin_by_sorting(
+    projected: Projected,
+    order: Tensor,
+    colors: wp.array,
+    camera: Camera,
+    memory: Tensor,
+    *,
+    places: bool,
+    tiles: bool,
+    keep: bool,
+) -> TileLists:
+    """Emit in depth order, sort by tile, list (CUDA); the lists are those of `bin_by_counting`."""
+    device, count, grid = order.device, len(order), _tile_count(camera)
+    size = [camera.width, camera.height]
+    splat_counts = scratch("splat counts", count, torch.int32, device)
+    splats = as_splats(memory)
+    inputs = [view(order, wp.int32), projected.splats, colors, view(projected.status, wp.uint8), *size]
+    launch_plain(binning.count_splat_tiles, count, inputs, [splats, view(splat_counts, wp.int32)], device=device)
+    entries, total = _first_places(splat_counts)
+    listed, places_of, tiles_of = (_intersections(name, total, device, keep) for name in ("listed", "places", "tiles"))
+    keys = scratch("tile keys", 2 * total, torch.int32, device)
+    values = scratch("tile values", 2 * total, torch.int32, device)
+    ranks = scratch("tile ranks", total, torch.int32, device)
+    outputs = [view(t, wp.int32) for t in (tiles_of, values, ranks)]
+    launch_plain(binning.emit_tiles, count, [splats, *size, view(entries, wp.int32)], outputs, device=device)
+    keys[:total] = tiles_of
+    if total:
+        wp.utils.radix_sort_pairs(view(keys, wp.int32), view(values, wp.int32), total, end_bit=grid.bit_length())
+    edges = torch.arange(grid + 1, dtype=torch.int32, device=device)
+    offsets = torch.searchsorted(keys[:total], edges).to(torch.int32)
+    outputs = [view(listed, wp.int32), view(places_of, wp.int32)]
+    launch_plain(binning.list_sorted, total, [view(values, wp.int32), view(ranks, wp.int32)], outputs, device=device)
+    return TileLists(order, memory, offsets, listed, entries, places_of, tiles_of)
+
+
+def _tile_count(camera: Camera) -> int:
+    return -(-camera.width // TILE) * -(-camera.height // TILE)
+
+
+def _intersections(name: str, count: int, device: torch.device, keep: bool) -> Tensor:
+    """One int32 for each of `count` intersections: scratch, or memory of its own where it is kept."""
+    return torch.empty(count, dtype=torch.int32, device=device) if keep else scratch(name, count, torch.int32, device)

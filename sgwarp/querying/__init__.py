@@ -1,0 +1,1 @@
+"""Text queries: scores, segmentation, localization, ensembles (paper, Sec. III-D)."""

@@ -1,0 +1,224 @@
+"""Answers from lifted semantics: a score per Gaussian and query."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Literal
+
+import torch
+from torch import Tensor
+
+from sgwarp.encoders.base import TextEncoder
+from sgwarp.encoders.prompts import CANONICAL
+from sgwarp.errors import InputError
+from sgwarp.querying.ensembles import Ensemble, combine, seen_by
+from sgwarp.scene import Semantics
+from sgwarp.scene.semantics import require_together
+
+CHUNK = 65536  # Gaussians scored at once: half precision features are widened chunk by chunk
+
+
+def query(semantics: Semantics, texts: Sequence[str], encoder: TextEncoder) -> Tensor:
+    """Cosine of every Gaussian's feature with every text, float32 [N, Q]; 0 where nothing was seen.
+
+    Raises:
+        InputError: No text, an empty text, or the encoder speaks another space than the semantics.
+    """
+    return _cosines(semantics, _encode(semantics, texts, encoder))
+
+
+def relevancy(
+    semantics: Semantics,
+    texts: Sequence[str],
+    encoder: TextEncoder,
+    canonical: Sequence[str] = CANONICAL,
+    scale: float = 10.0,
+) -> Tensor:
+    """How much better a text fits than any canonical phrase (Kerr et al., LERF, 2023), float32 [N, Q] in [0, 1].
+
+    The smallest, over the canonical phrases, of the first entry of softmax(scale * [cosine of the text, cosine of the
+    phrase]); above 0.5 the text beats all of them. 0 where nothing was seen.
+
+    Raises:
+        InputError: As `query`.
+    """
+    cosines = _cosines(semantics, _encode(semantics, [*texts, *canonical], encoder))
+    wanted, rivals = cosines[:, : len(texts)], cosines[:, len(texts) :]
+    better = torch.sigmoid(scale * (wanted - rivals.max(dim=1, keepdim=True).values))
+    return torch.where(semantics.seen.to(better.device)[:, None], better, 0.0)
+
+
+def standardise(scores: Tensor, seen: Tensor) -> Tensor:
+    """Scores [N, Q] with mean 0 and deviation 1 per query over the seen Gaussians, so that no query is louder than
+    another; 0 where nothing was seen."""
+    seen = seen.to(scores.device)
+    known = scores[seen].double()
+    if not len(known):
+        return torch.zeros_like(scores)
+    deviation, mean = torch.std_mean(known, dim=0, correction=0)
+    scaled = (scores - mean) / torch.where(deviation > 0, deviation, 1.0)
+    return torch.where(seen[:, None], scaled, 0.0).to(scores.dtype)
+
+
+def evidence(scores: Tensor, semantics: Semantics) -> Tensor:
+    """How far scores [N, Q] stand out from the scene, trusted as far as the Gaussian was seen.
+
+    `standardise`, times w / (w + median w) with w the weight behind a Gaussian's feature: one that a single grazing
+    pixel saw says little. 0 is the scene's mean, 1 its deviation; 0 where nothing was seen.
+    """
+    weight = semantics.weight.to(scores.device)
+    seen = semantics.seen.to(scores.device)
+    if not bool(seen.any()):
+        return torch.zeros_like(scores)
+    return standardise(scores, seen) * (weight / (weight + weight[seen].median()))[:, None]
+
+
+def rescale(scores: Tensor, seen: Tensor) -> Tensor:
+    """Scores [N, Q] on a scale where 0 is the median over the seen Gaussians and 1 the best thousandth of them.
+
+    A query then has one threshold for all views of the scene, unlike with a scale made per picture, on which something
+    is always found. 0 where nothing was seen, and everywhere if all scores are equal.
+    """
+    seen = seen.to(scores.device)
+    known = scores[seen].sort(dim=0).values
+    if not len(known):
+        return torch.zeros_like(scores)
+    low, high = known[len(known) // 2], known[int(0.999 * (len(known) - 1))]
+    scaled = (scores - low) / torch.where(high > low, high - low, torch.inf)
+    return torch.where(seen[:, None], scaled, 0.0)
+
+
+def confidence(scores: Tensor, temperature: float) -> Tensor:
+    """Softmax of scores / temperature over the queries, [..., Q].
+
+    Raises:
+        InputError: The temperature is not positive and finite.
+    """
+    if not 1e-6 <= temperature < float("inf"):
+        raise InputError(f"temperature: expected a number from 1e-6 on, got {temperature}")
+    return torch.softmax(scores / temperature, dim=-1)
+
+
+Scoring = Literal["evidence", "cosine"]
+TEMPERATURES: dict[Scoring, float] = {"evidence": 0.3, "cosine": 0.1}
+NONE_LEVEL = 1.0  # evidence of "none of these": a class must stand out further from the scene's mean
+
+
+def class_votes(
+    semantics: Semantics,
+    classes: Sequence[str] | None,
+    encoder: TextEncoder | None = None,
+    temperature: float | None = None,
+    scoring: Scoring = "cosine",
+    *,
+    predicted: Semantics | None = None,
+    ensemble: Ensemble = "max",
+) -> Tensor:
+    """How much every Gaussian speaks for every class, float32 [N, Q]; 0 where nothing was seen.
+
+    For lifted label or id images the lifted shares themselves, of all labels if `classes` is None. In a text space:
+
+    - "evidence": softmax over the classes' `evidence` and a level for none of them. No class wins everywhere by being
+      loud, and what fits none of the names goes to none; for a list of what to look for.
+    - "cosine": softmax over the cosines (paper, Sec. III-D); for a list that names everything in the scene.
+
+    Args:
+        semantics: N Gaussians.
+        classes: Q names.
+        encoder: Text encoder of the semantics' space.
+        temperature: Of the softmax; None for 0.3 (evidence) or 0.1 (cosine).
+        scoring: See above.
+        predicted: Semantics that the network predicts for the same Gaussians; the scores of the two become one before
+            the softmax (paper, Sec. III-D), shares before they are made to add up to 1 again.
+        ensemble: How, see `combine`.
+
+    Raises:
+        InputError: No classes, or an encoder missing, where one is needed; a class that is not among the lifted labels;
+            predicted semantics of another scene or space.
+    """
+    both = [semantics]
+    if predicted is not None:
+        require_together(semantics, predicted)
+        both.append(predicted)
+    seen = seen_by(semantics, predicted, ensemble)
+    if semantics.labels is not None:
+        if predicted is None:
+            return _label_shares(semantics, classes)
+        # A sum of shares is twice their mean; the largest of both may add up to more than all there is.
+        how: Ensemble = "mean" if ensemble == "sum" else ensemble
+        total = _together([_label_shares(one, None) for one in both], both, how).sum(dim=1, keepdim=True)
+        return _together([_label_shares(one, classes) for one in both], both, how) / total.clamp(min=1.0)
+    if not classes:
+        raise InputError(f"classes: semantics in space '{semantics.space}' need the names of the classes to look for")
+    if encoder is None:
+        raise InputError(f"encoder: classes need the text encoder of space '{semantics.space}'")
+    if scoring not in TEMPERATURES:
+        raise InputError(f"scoring: expected one of {', '.join(TEMPERATURES)}, got '{scoring}'")
+    each = [query(one, classes, encoder) for one in both]
+    if scoring == "evidence":
+        each = [evidence(scores, one) for scores, one in zip(each, both, strict=True)]
+    scores = _together(each, both, ensemble)
+    if scoring == "evidence":
+        level = NONE_LEVEL * (2 if len(both) == 2 and ensemble == "sum" else 1)
+        scores = torch.cat([scores, torch.full_like(scores[:, :1], level)], dim=1)
+    votes = confidence(scores, TEMPERATURES[scoring] if temperature is None else temperature)[:, : len(classes)]
+    return torch.where(seen.to(votes.device)[:, None], votes, 0.0)
+
+
+def _label_shares(semantics: Semantics, classes: Sequence[str] | None) -> Tensor:
+    """Lifted or predicted shares of the labels, [N, Q]."""
+    assert semantics.labels is not None
+    if classes is None:
+        return semantics.features.to(torch.float32)
+    missing = [name for name in classes if name not in semantics.labels]
+    if missing:
+        raise InputError(f"class '{missing[0]}' is not among the lifted labels: {', '.join(semantics.labels)}")
+    return semantics.features[:, [semantics.labels.index(name) for name in classes]].to(torch.float32)
+
+
+def _together(scores: list[Tensor], semantics: list[Semantics], ensemble: Ensemble) -> Tensor:
+    """Scores of the one semantics there is, or of the ensemble of the two, [N, Q]."""
+    if len(scores) == 1:
+        return scores[0]
+    return combine(scores[0], scores[1], (semantics[0].seen, semantics[1].seen), ensemble)
+
+
+def select(scores: Tensor, threshold: float | None = None, top_share: float | None = None) -> Tensor:
+    """Gaussians whose score [N] is above `threshold`, or the `top_share` of them with the best scores, bool [N].
+
+    Raises:
+        InputError: Not exactly one of the two is given, the share is outside (0, 1], or scores has another shape.
+    """
+    if scores.ndim != 1:
+        raise InputError(f"scores: expected shape [N], one query at a time, got {list(scores.shape)}")
+    if (threshold is None) == (top_share is None):
+        raise InputError("give either threshold or top_share")
+    if threshold is not None:
+        return scores > threshold
+    assert top_share is not None
+    if not 0 < top_share <= 1:
+        raise InputError(f"top_share: expected a share in (0, 1], got {top_share}")
+    chosen = torch.zeros(len(scores), dtype=torch.bool, device=scores.device)
+    chosen[scores.topk(round(top_share * len(scores))).indices] = True
+    return chosen
+
+
+def _encode(semantics: Semantics, texts: Sequence[str], encoder: TextEncoder) -> Tensor:
+    """Unit vectors of the texts, float32 [Q, C]."""
+    if not texts or not all(text.strip() for text in texts):
+        raise InputError("texts: expected at least one phrase, and no empty one")
+    semantics.require_space(encoder.space)
+    vectors = encoder.encode_text(list(texts))
+    if vectors.shape != (len(texts), semantics.features.shape[1]):
+        channels = semantics.features.shape[1]
+        raise InputError(f"text vectors of shape {list(vectors.shape)} cannot be compared with {channels} channels")
+    return vectors.to(semantics.features.device, torch.float32)
+
+
+def _cosines(semantics: Semantics, vectors: Tensor) -> Tensor:
+    scores = vectors.new_empty(len(semantics), len(vectors))
+    for start in range(0, len(semantics), CHUNK):
+        rows = semantics.features[start : start + CHUNK].to(torch.float32)
+        norm = rows.norm(dim=1, keepdim=True)
+        scores[start : start + CHUNK] = (rows @ vectors.T) / torch.where(norm > 0, norm, 1.0)
+    return scores

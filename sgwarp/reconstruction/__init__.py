@@ -1,0 +1,1 @@
+"""Scenes from images: fitted by gradient descent or made from depth."""

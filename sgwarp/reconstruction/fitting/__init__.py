@@ -1,0 +1,1 @@
+"""Fitting Gaussians to photographs: starting points, model, loss, density control, checkpoints, report."""

@@ -1,0 +1,182 @@
+"""The photographs of a fit: read once, checked, made smaller, and kept as bytes."""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from sgwarp.errors import InputError
+from sgwarp.files.images import read_alpha, read_ids
+from sgwarp.runs.progress import Report
+from sgwarp.scene import Camera, View
+
+logger = logging.getLogger("sgwarp")
+LEAST_VIEWS = 3  # with fewer, nearly any scene explains them
+EXTENT_MARGIN = 1.1  # of the reference implementation
+
+Masks = Callable[[View], Any]
+
+
+@dataclass(frozen=True, eq=False)
+class Photograph:
+    """One photograph and the camera that took it.
+
+    Attributes:
+        stem: Name of the view.
+        camera: At the size of `pixels`.
+        pixels: uint8 [H, W, 3].
+        mask: Which pixels count, bool [H, W], or None for all.
+        alpha: How opaque the pixels are, float32 [H, W] in [0, 1], or None where all are.
+        path: Its file.
+    """
+
+    stem: str
+    camera: Camera
+    pixels: Tensor
+    mask: Tensor | None = None
+    alpha: Tensor | None = None
+    path: Path | None = None
+
+    def image(self, background: Tensor | None = None) -> Tensor:
+        """float32 [H, W, 3] in [0, 1]; transparent pixels show the background, float32 [3], black if None."""
+        image = self.pixels.to(torch.float32) / 255.0
+        if self.alpha is None:
+            return image
+        image = image * self.alpha[..., None]
+        return image if background is None else image + (1.0 - self.alpha[..., None]) * background
+
+
+def read_photographs(
+    views: Sequence[View],
+    *,
+    downscale: int = 1,
+    masks: Masks | None = None,
+    device: str | torch.device = "cpu",
+    progress: Report | None = None,
+) -> list[Photograph]:
+    """Read all photographs.
+
+    Args:
+        views: Posed photographs.
+        downscale: Divide width and height by this; pixels are averaged.
+        masks: Which pixels of a view count, [H, W] of its photograph, zero for those that do not; or None for all.
+
+    Raises:
+        InputError: A photograph is missing, cannot be read, or does not have its camera's size; a mask does not fit.
+    """
+    if downscale < 1:
+        raise InputError(f"downscale: expected a whole number of at least 1, got {downscale}")
+    report = progress or (lambda done, total, name: None)
+    photographs = []
+    report(0, len(views), "")
+    for done, view in enumerate(views, start=1):
+        photographs.append(_read(view, downscale, masks, device))
+        report(done, len(views), view.stem)
+    return photographs
+
+
+def _read(view: View, downscale: int, masks: Masks | None, device: str | torch.device) -> Photograph:
+    import cv2
+
+    if view.image_path is None:
+        raise InputError(f"view {view.stem}: has no photograph; a scene is fitted to photographs")
+    pixels = (view.image().numpy() * 255.0).round().astype(np.uint8)
+    alpha: Any = read_alpha(view.image_path)
+    if alpha is not None and view.undistort is not None:
+        alpha = view.undistort(np.repeat(alpha[..., None], 3, axis=2))[..., 0]
+    mask = None if masks is None else masks(view)
+    if mask is not None:
+        mask = np.asarray(mask) != 0
+        if mask.shape != view.camera.size:
+            got, want = list(mask.shape), list(view.camera.size)
+            raise InputError(f"view {view.stem}: its mask has shape {got}, its photograph {want}; resize one of them")
+        if not mask.any():
+            raise InputError(f"view {view.stem}: its mask leaves no pixel; remove the view or its mask")
+    camera = view.camera
+    if downscale > 1:
+        height, width = (max(1, round(size / downscale)) for size in camera.size)
+        camera = camera.resized(height, width)
+        pixels = cv2.resize(pixels, (width, height), interpolation=cv2.INTER_AREA)
+        if mask is not None:
+            mask = cv2.resize(mask.astype(np.float32), (width, height), interpolation=cv2.INTER_AREA) > 0.5
+            if not mask.any():
+                raise InputError(f"view {view.stem}: its mask leaves no pixel at this size; take a smaller downscale")
+        if alpha is not None:
+            alpha = cv2.resize(alpha, (width, height), interpolation=cv2.INTER_AREA)
+    known = None if mask is None else torch.from_numpy(mask).to(device)
+    opaque = None if alpha is None else torch.from_numpy(np.ascontiguousarray(alpha)).to(device, torch.float32) / 255.0
+    return Photograph(view.stem, camera, torch.from_numpy(pixels).to(device), known, opaque, Path(view.image_path))
+
+
+def masks_from_folder(folder: Path, views: Sequence[View]) -> Masks:
+    """Masks named like the views, {stem}.png; zero is left out, and a view without a mask counts as a whole.
+
+    Raises:
+        InputError: No view has a mask there.
+    """
+    paths = {view.stem: folder / f"{view.stem}.png" for view in views}
+    missing = [path.name for path in paths.values() if not path.is_file()]
+    if len(missing) == len(paths):
+        raise InputError(f"{folder}: holds no mask of any view; expected files such as {views[0].stem}.png")
+    if missing:
+        logger.warning("%s: %d of %d views have no mask (%s, ...)", folder, len(missing), len(paths), missing[0])
+
+    def mask(view: View) -> Any:
+        path = paths.get(view.stem)
+        return read_ids(path) if path is not None and path.is_file() else None
+
+    return mask
+
+
+def require_enough(views: Sequence[View]) -> None:
+    """Raise InputError unless there are enough photographs to fit a scene to."""
+    if len(views) < LEAST_VIEWS:
+        names = f" ({', '.join(view.stem for view in views)})" if views else ""
+        raise InputError(
+            f"{len(views)} photographs are left to fit to{names}; a scene needs at least {LEAST_VIEWS}: add "
+            "photographs, or hold out fewer"
+        )
+
+
+def require_overlap(photographs: Sequence[Photograph], means: Tensor, held_out: Sequence[Photograph] = ()) -> None:
+    """Raise InputError naming a photograph that shows none of the points [N, 3] that the scene starts from.
+
+    Of photographs that nothing is fitted to, only warn.
+    """
+    for blind in (p for p in held_out if not bool(_shown(p.camera, means).any())):
+        logger.warning("held-out view %s shows none of the points to start from: is its pose right?", blind.stem)
+    blinds = [p for p in photographs if not bool(_shown(p.camera, means).any())]
+    if blinds:
+        camera, first = blinds[0].camera, blinds[0].path or blinds[0].stem
+        raise InputError(
+            f"{first}: shows none of the {len(means)} points that the scene starts from, between "
+            f"{camera.near:g} and {camera.far:g} m of depth ({len(blinds)} of {len(photographs)} photographs do not); "
+            "correct its pose, remove it, or start without points (--init random)"
+        )
+
+
+def _shown(camera: Camera, means: Tensor) -> Tensor:
+    """Which points lie in the image, bool [N]."""
+    pose = camera.world_to_camera.to(means)
+    points = means @ pose[:3, :3].T + pose[:3, 3]
+    pixels = points @ camera.K.to(means).T
+    x, y = pixels[:, 0] / points[:, 2], pixels[:, 1] / points[:, 2]
+    inside = (x >= 0) & (x < camera.width) & (y >= 0) & (y < camera.height)
+    return inside & (points[:, 2] > camera.near) & (points[:, 2] < camera.far)
+
+
+def camera_extent(views: Sequence[View]) -> float:
+    """Radius of the cameras around their centre [m], to which rates and sizes are relative; 1 if all are in one place.
+
+    As in the reference implementation, a tenth wider.
+    """
+    places = torch.stack([view.camera.position for view in views])
+    radius = float((places - places.mean(dim=0)).norm(dim=1).max())
+    return EXTENT_MARGIN * radius if radius > 1e-6 else 1.0

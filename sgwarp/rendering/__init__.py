@@ -1,0 +1,1 @@
+"""Pictures of a scene, and cameras to take them from."""

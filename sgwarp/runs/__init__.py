@@ -1,0 +1,1 @@
+"""How long work behaves: progress, log, interruption, random numbers."""

@@ -1,0 +1,83 @@
+"""What a run did, how long it took and how wrong it is, side by side in `run.json`."""
+
+from __future__ import annotations
+
+import json
+import math
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import asdict, dataclass, field
+from pathlib import Path
+
+from sgwarp.files.atomic import atomic_path
+from sgwarp.version import __version__
+
+
+@dataclass
+class RunLog:
+    """Record of one run, filled while it goes and written once at the end.
+
+    Attributes:
+        command: The command line, or a name for a run from Python.
+        version: Version of the package.
+        device: "cpu" or a CUDA device.
+        threads: Host threads used on the CPU.
+        stages: Wall-clock seconds spent in each stage.
+        left_out: What was skipped because the scene or the request did not need it: how many, or seconds saved.
+        error: The run's own error figures.
+        outputs: Files written.
+        curve: How a run that improves step by step got there, one row of numbers per measurement; else left out.
+    """
+
+    command: str = ""
+    version: str = field(default=__version__, init=False)
+    device: str = "cpu"
+    threads: int = 1
+    stages: dict[str, float] = field(default_factory=dict)
+    left_out: dict[str, float] = field(default_factory=dict)
+    error: dict[str, float] = field(default_factory=dict)
+    outputs: list[str] = field(default_factory=list)
+    curve: list[dict[str, float]] = field(default_factory=list)
+
+    @contextmanager
+    def stage(self, name: str) -> Iterator[None]:
+        """Add the time spent in the block to stage `name`; one stage may be entered many times."""
+        start = time.perf_counter()
+        try:
+            yield
+        finally:
+            if self.device.startswith("cuda"):
+                import torch
+
+                torch.cuda.synchronize(self.device)  # launches return before their work is done
+            self.stages[name] = self.stages.get(name, 0.0) + time.perf_counter() - start
+
+    def leave_out(self, what: str, amount: float = 1) -> None:
+        """Count what was left out; nothing is recorded for an amount of zero."""
+        if amount:
+            self.left_out[what] = self.left_out.get(what, 0) + amount
+
+    def write(self, folder: Path) -> Path:
+        """Write `run.json` into `folder`, whole or not at all; numbers that are not finite become null."""
+        record = asdict(self)
+        record["stages"] = {name: round(seconds, 4) for name, seconds in self.stages.items()}
+        record["error"] = _finite(self.error)
+        record["curve"] = [_finite(row) for row in self.curve]
+        if not self.curve:
+            del record["curve"]
+        path = folder / "run.json"
+        with atomic_path(path) as temporary:
+            temporary.write_text(json.dumps(record, indent=2, allow_nan=False) + "\n", encoding="utf-8")
+        return path
+
+    def summary(self) -> str:
+        """One line: times, error figures, what was left out."""
+        times = ", ".join(f"{name} {seconds:.2f} s" for name, seconds in self.stages.items())
+        errors = ", ".join(f"{name} {value:.4f}" for name, value in self.error.items())
+        left = ", ".join(f"{amount:g} {what.replace('_', ' ')}" for what, amount in self.left_out.items())
+        return "; ".join(part for part in (times, errors, f"left out: {left}" if left else "") if part)
+
+
+def _finite(numbers: dict[str, float]) -> dict[str, float | None]:
+    return {name: value if math.isfinite(value) else None for name, value in numbers.items()}

@@ -1,0 +1,38 @@
+"""Checks and conversions that the scene types share."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from sgwarp.errors import InputError
+
+
+def require(condition: bool, message: str) -> None:
+    if not condition:
+        raise InputError(message)
+
+
+def float32(name: str, value: Any, shape: tuple[int | None, ...]) -> Tensor:
+    """Convert to a contiguous float32 tensor of `shape` (None matches any size)."""
+    tensor = torch.as_tensor(value)
+    require(tensor.is_floating_point(), f"{name}: expected floating point values, got {tensor.dtype}")
+    fits = tensor.ndim == len(shape) and all(w is None or w == s for w, s in zip(shape, tensor.shape, strict=False))
+    wanted = ", ".join("any" if s is None else str(s) for s in shape)
+    require(fits, f"{name}: expected shape [{wanted}], got {list(tensor.shape)}")
+    return tensor.to(torch.float32).contiguous()
+
+
+def version_of(*tensors: Tensor) -> tuple[int, ...]:
+    """Changes whenever one of the tensors is written to in place."""
+    return tuple(0 if tensor.is_inference() else tensor._version for tensor in tensors)
+
+
+def require_rows(name: str, bad: Tensor, rule: str, values: Tensor) -> None:
+    """Raise naming the first row where `bad` is set."""
+    rows = bad.flatten(1).any(dim=1) if bad.ndim > 1 else bad  # reshape(0, -1) is ambiguous
+    if bool(rows.any()):
+        index = int(rows.nonzero()[0])
+        raise InputError(f"{name}[{index}] = {values[index].tolist()}: {rule} ({int(rows.sum())} such rows)")

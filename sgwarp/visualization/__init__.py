@@ -1,0 +1,1 @@
+"""Pictures for people: color maps, overlays, legends."""

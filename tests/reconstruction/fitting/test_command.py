@@ -1,0 +1,178 @@
+"""`sgwarp fit`: files in, files and exit codes out."""
+
+import json
+import os
+import shutil
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import pytest
+import torch
+
+from sgwarp.cli import main
+from sgwarp.errors import InputError
+from sgwarp.files.images import read_rgb
+from sgwarp.io.scenes import load_gaussians
+
+
+def fails(capsys, *arguments) -> str:
+    """Run a command that has to end with code 2; returns its one line on stderr."""
+    assert main(["fit", *map(str, arguments)]) == 2
+    lines = capsys.readouterr().err.strip().splitlines()
+    assert len(lines) == 1
+    return lines[0]
+
+
+def test_a_folder_of_photographs_becomes_a_scene(boards, tmp_path, capsys):
+    out = tmp_path / "new" / "scene.ply"
+    arguments = ["--out", out, "--steps", 120, "--hold-out", 4, "--cap", 1200, "--sh-degree", 0, "--threads", 2]
+    assert main(["fit", str(boards.folder), *map(str, arguments)]) == 0
+    assert "held_out_psnr" in capsys.readouterr().out
+    scene = load_gaussians(out)
+    assert 1000 < len(scene) <= 1200
+    run = json.loads((out.parent / "run.json").read_text())
+    assert run["error"]["held_out_psnr"] > 19
+    assert set(run["stages"]) == {"start", "read", "fit", "measure", "write"}
+    assert run["left_out"]["updates_of_unseen_gaussians"] > 0
+    steps = [point["step"] for point in run["curve"]]
+    assert steps == list(range(12, 121, 12))
+    seconds = [point["seconds"] for point in run["curve"]]
+    assert seconds == sorted(seconds)
+    assert run["curve"][-1]["psnr"] == run["error"]["held_out_psnr"] > run["curve"][0]["psnr"]
+    assert [Path(name).name for name in run["outputs"]] == ["scene.ply", "scene.held_out.jpg", "scene.curve.png"]
+    sheet = read_rgb(out.with_name("scene.held_out.jpg"))
+    assert sheet.shape == (2 * (300 + 6), 3 * 400 + 2 * 6, 3)
+    assert read_rgb(out.with_name("scene.curve.png")).std() > 5
+    assert not list(out.parent.glob("*.checkpoint"))
+
+
+def test_the_contact_sheet_shows_truth_rendering_and_difference(boards, tmp_path):
+    from sgwarp.reconstruction.fitting.photographs import read_photographs
+    from sgwarp.reconstruction.fitting.report import write_contact_sheet
+    from sgwarp.scene import Gaussians
+
+    (photograph,) = read_photographs(boards.views[:1])
+    nothing = Gaussians(*(torch.zeros(1, *shape) for shape in ((3,), (4,), (3,), (), (1, 3))))
+    write_contact_sheet(nothing, [photograph], tmp_path / "sheet.png")
+    truth, rendering, difference = (read_rgb(tmp_path / "sheet.png")[60:300, k : k + 400] for k in (0, 406, 812))
+    means = photograph.image()[10:].mean(dim=(0, 1)) * 255
+    assert abs(truth.mean(axis=(0, 1)) - means.numpy()).max() < 4
+    assert rendering.max() == 0
+    assert difference.mean() > 150  # all of it is wrong, which is the bright end of the colours
+
+
+def test_a_fit_starts_from_depth(boards, tmp_path):
+    out = tmp_path / "scene.compressed.ply"
+    depth = ["--depth", str(boards.folder / "depth"), "--hold-out", "0", "--cap", "900", "--steps", "5"]
+    assert main(["fit", str(boards.folder), "--out", str(out), *depth]) == 0
+    assert len(load_gaussians(out)) > 100
+    run = json.loads((tmp_path / "run.json").read_text())
+    assert "held_out_psnr" not in run["error"]
+    assert run["outputs"] == [str(out)]
+    assert run["curve"][-1]["psnr"] is None
+
+
+def test_a_fit_starts_from_nothing(boards, tmp_path):
+    out = tmp_path / "scene.ply"
+    options = ["--init", "random", "--steps", "3", "--cap", "500", "--downscale", "2", "--strategy", "default"]
+    assert main(["fit", str(boards.folder), "--out", str(out), *options, "--background", "random", "--exposure"]) == 0
+    assert len(load_gaussians(out)) == 500
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        (["--hold-out", "-1"], "--hold-out: expected 0 or more, got -1"),
+        (["--hold-out", "1"], "0 photographs are left to fit to; a scene needs at least 3"),
+        (["--steps", "0"], "steps: expected at least 1, got 0"),
+        (["--downscale", "0"], "downscale: expected a whole number of at least 1"),
+        (["--init", "depth"], "--init depth: needs --depth"),
+        (["--points", "missing.ply"], "missing.ply: no such file or folder; check the path"),
+        (["--resume"], "scene.ply.checkpoint: no such file"),
+        (["--checkpoint-every", "0"], "checkpoint_every: expected at least 1"),
+        (["--masks", "."], "holds no mask of any view"),
+        (["--cap", "2"], "cap: a scene starts from at least 4 points"),
+    ],
+)
+def test_bad_options(boards, tmp_path, capsys, monkeypatch, options, message):
+    monkeypatch.chdir(tmp_path)
+    assert message in fails(capsys, boards.folder, "--out", tmp_path / "scene.ply", *options)
+    assert not list(tmp_path.glob("*.ply"))
+
+
+def test_bad_names(boards, tmp_path, capsys):
+    assert "the name must end in .ply" in fails(capsys, boards.folder, "--out", tmp_path / "scene.splat")
+    assert "holds no views" in fails(capsys, tmp_path, "--out", tmp_path / "scene.ply")
+
+
+def test_a_damaged_photograph(boards, tmp_path, capsys):
+    folder = Path(shutil.copytree(boards.folder, tmp_path / "stage"))
+    (folder / "images" / "0002.png").write_bytes(b"")
+    line = fails(capsys, folder, "--out", tmp_path / "scene.ply")
+    assert "0002.png: image is cut short (0 bytes); copy or download it again" in line
+
+
+def start(boards, out: Path) -> subprocess.Popen:
+    options = ["--steps", "4000", "--cap", "1100", "--checkpoint-every", "20", "--out", str(out), "--threads", "1"]
+    code = "import sys; from sgwarp.cli import main; sys.exit(main(sys.argv[1:]))"
+    command = [sys.executable, "-c", code, "fit", str(boards.folder), *options]
+    process = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, env={**os.environ})
+    while not out.with_name(f"{out.name}.checkpoint").exists():
+        if process.poll() is not None:
+            pytest.fail(process.stderr.read())
+        time.sleep(0.01)
+    return process
+
+
+def test_ctrl_c_leaves_a_scene_and_a_checkpoint(boards, tmp_path):
+    out = tmp_path / "scene.ply"
+    process = start(boards, out)
+    process.send_signal(signal.SIGINT)
+    _, errors = process.communicate(timeout=120)
+    assert process.returncode == 130, errors
+    assert errors.strip().endswith("sgwarp: interrupted")
+    scene = load_gaussians(out)
+    assert not scene.non_finite
+    checkpoint = torch.load(out.with_name("scene.ply.checkpoint"), weights_only=True)
+    assert len(checkpoint["model"]["steps"]) == len(scene)
+    run = json.loads((tmp_path / "run.json").read_text())
+    assert run["curve"][-1]["step"] == checkpoint["step"] < 4000
+
+
+def test_a_scene_that_cannot_be_written_costs_no_run(boards, tmp_path, capsys, monkeypatch):
+    """The checkpoint of the last step stays until the scene is on the disk."""
+    out = tmp_path / "scene.ply"
+    arguments = ["fit", str(boards.folder), "--out", str(out), "--steps", "20", "--cap", "1200"]
+
+    def full(*_: object) -> None:
+        raise InputError("no space left on device")
+
+    with monkeypatch.context() as patch:
+        patch.setattr("sgwarp.io.scenes.save_gaussians", full)
+        assert main(arguments) == 2
+    assert out.with_name("scene.ply.checkpoint").is_file()
+    assert main([*arguments, "--resume"]) == 0
+    assert len(load_gaussians(out)) > 1000
+    assert not out.with_name("scene.ply.checkpoint").exists()
+
+
+def test_names_that_would_be_taken_for_something_else(boards, tmp_path, capsys):
+    (tmp_path / "folder.ply").mkdir()
+    assert "is a folder; choose another name" in fails(capsys, boards.folder, "--out", tmp_path / "folder.ply")
+    folder = Path(shutil.copytree(boards.folder, tmp_path / "stage"))
+    assert "is a name of the points" in fails(capsys, folder, "--out", folder / "point_cloud.ply")
+
+
+def test_a_damaged_checkpoint(boards, tmp_path, capsys):
+    (tmp_path / "scene.ply.checkpoint").write_text("junk")
+    message = fails(capsys, boards.folder, "--out", tmp_path / "scene.ply", "--steps", "5", "--resume")
+    assert "is not a checkpoint, or is damaged" in message
+
+
+def test_short_runs_reach_their_degree(boards, tmp_path):
+    out = tmp_path / "scene.ply"
+    assert main(["fit", str(boards.folder), "--out", str(out), "--steps", "16", "--cap", "1200"]) == 0
+    assert load_gaussians(out).sh.shape[1] == 16
