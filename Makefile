@@ -1,7 +1,7 @@
 # `make test` and `make demo` need Python 3.10 or later, make and a C library; everything else goes into .venv.
 .DEFAULT_GOAL := help
 .NOTPARALLEL:
-.PHONY: help test demo lint bench clean
+.PHONY: help test demo lint docs bench clean
 
 VENV := .venv
 BIN := $(VENV)/bin
@@ -16,6 +16,7 @@ help:
 	@echo "make test   install into $(VENV), run the tests       (ARGS='tests/io -x' for some of them)"
 	@echo "make demo   install into $(VENV), run the demonstration; pictures and a table go to demo_out/"
 	@echo "make lint   ruff and mypy"
+	@echo "make docs   build the documentation into site/; warnings are errors"
 	@echo "make bench  the benchmarks, as ratios within one run"
 	@echo "make clean  remove what the other targets built"
 
@@ -30,16 +31,21 @@ lint: $(VENV)/installed-dev
 	$(BIN)/ruff format --check $(SOURCES)
 	$(BIN)/mypy
 
+docs: $(VENV)/installed-docs
+	NO_MKDOCS_2_WARNING=1 $(BIN)/python -m mkdocs build --strict --quiet
+	@echo "open site/index.html"
+
 bench: $(VENV)/installed-test
 	$(BIN)/python -m benchmarks $(ARGS)
 
 clean:
-	rm -rf $(VENV) demo_out build dist .pytest_cache .mypy_cache .ruff_cache .hypothesis
+	rm -rf $(VENV) demo_out site build dist .pytest_cache .mypy_cache .ruff_cache .hypothesis
 	find $(SOURCES) -name __pycache__ -type d -prune -exec rm -rf {} +
 
 $(VENV)/installed-test: EXTRAS = test,ptx
 $(VENV)/installed-demo: EXTRAS = demo
 $(VENV)/installed-dev: EXTRAS = dev
+$(VENV)/installed-docs: EXTRAS = docs
 
 # One stamp per set of extras: installed again only when what is asked for changes.
 $(VENV)/installed-%: pyproject.toml constraints.txt | $(BIN)/python

@@ -103,8 +103,9 @@ def load_network(
 
     Args:
         path: .safetensors, or a file of torch.save.
-        inputs, voxel, space: For a checkpoint, which does not say: by default the only inputs that have its number of
-            channels, 0.02 m, and the file's name. They must not contradict a file that does say.
+        inputs: Input mode of a checkpoint, which does not store it; by default the only mode with its number of channels.
+        voxel: Edge of a voxel [m], 0.02 for a checkpoint. Must not contradict what the file stores.
+        space: Embedding space of the output, by default the file's name. Must not contradict what the file stores.
 
     Raises:
         InputError: The file cannot be read or fits no architecture, or an argument contradicts it.

@@ -27,7 +27,8 @@ def orbit_views(gaussians: Gaussians, count: int, width: int, height: int, up: s
     Args:
         gaussians: The scene.
         count: Number of views.
-        width, height: Of the images [pixels].
+        width: Width of the images [pixels].
+        height: Height of the images [pixels].
         up: Direction of the scene's axes: "y-down" (OpenCV, most scenes from photographs), "y-up", "z-up", "z-down".
 
     Raises:

@@ -80,7 +80,10 @@ def plan(
     """What `render` would compute and what it would leave out, as `print` shows it.
 
     Args:
-        gaussians, mode, features, settings: As for `render`.
+        gaussians: As for `render`.
+        mode: As for `render`.
+        features: As for `render`.
+        settings: As for `render`.
 
     Raises:
         InputError: Unknown mode, or features missing where they are needed or given where they are not.

@@ -52,15 +52,18 @@ def rasterize(
         viewmat: World to camera, OpenCV axes, rigid, float [4, 4]. Its gradient is that of the 12 free entries of
             p = R m + t; project it onto rigid motions by parametrising them.
         K: Intrinsics [pixels], [3, 3].
-        width, height: Image size [pixels].
+        width: Image width [pixels].
+        height: Image height [pixels].
         sh: Spherical-harmonic coefficients, float [N, K, 3]; colours are composited.
         features: Any other values to composite, float [N, C]; exactly one of `sh` and `features` is given.
         background: Seen through what is left transparent, float [C]; None is zero.
         means2d: float [N, 2], added to the projected centres as far as gradients go: its values are not read, and its
             gradient is that of the projected centres [1 / pixels], which densification looks at.
         absgrad: Also add the sum over pixels of the magnitude of each one's gradient to `means2d.absgrad` (AbsGS).
-        expected_depth, depth: Which depths to render, as in `sg.render`; both have gradients.
-        near, far: Range of depth that is rendered [m].
+        expected_depth: Render the expected depth, as in `sg.render`; it has gradients.
+        depth: Render the surface depth, as in `sg.render`; it has gradients.
+        near: Least depth that is rendered [m].
+        far: Largest depth that is rendered [m].
         settings: The approximations.
         schedule: "lanes" or "block", by default the device's own; either runs on the CPU.
         deterministic: Add gradients up in a fixed order. The CPU always does; on CUDA the default is atomic additions.
