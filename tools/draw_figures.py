@@ -31,10 +31,10 @@ def exists(name: str) -> bool:
     return any((ROOT / place).exists() for place in (f"sgwarp/{name}", f"sgwarp/{name}.py"))
 
 
-def box(axes: Axes, x: float, y: float, width: float, height: float, text: str, fill: str = FILL, size: int = 10) -> None:
+def box(axes: Axes, x: float, y: float, width: float, height: float, text: str, fill: str = FILL) -> None:
     shape = FancyBboxPatch((x, y), width, height, boxstyle="round,pad=0,rounding_size=0.12", fc=fill, ec=EDGE, lw=1.2)
     axes.add_patch(shape)
-    axes.text(x + width / 2, y + height / 2, text, ha="center", va="center", fontsize=size, color=INK)
+    axes.text(x + width / 2, y + height / 2, text, ha="center", va="center", fontsize=10, color=INK)
 
 
 def arrow(axes: Axes, start: tuple[float, float], end: tuple[float, float]) -> None:
@@ -87,7 +87,8 @@ def draw_pipeline() -> None:
     ):
         arrow(axes, start, end)
     axes.text(5.0, 3.45, "Warp kernels, CPU and CUDA", fontsize=9, color=INK, va="center")
-    axes.add_patch(FancyBboxPatch((4.62, 3.36), 0.28, 0.18, boxstyle="round,pad=0,rounding_size=0.05", fc=ACCENT, ec=EDGE))
+    legend = "round,pad=0,rounding_size=0.05"
+    axes.add_patch(FancyBboxPatch((4.62, 3.36), 0.28, 0.18, boxstyle=legend, fc=ACCENT, ec=EDGE))
     figure.savefig(IMAGES / "pipeline.png", dpi=150)
 
 

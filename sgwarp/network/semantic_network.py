@@ -103,7 +103,7 @@ def load_network(
 
     Args:
         path: .safetensors, or a file of torch.save.
-        inputs: Input mode of a checkpoint, which does not store it; by default the only mode with its number of channels.
+        inputs: Input mode, which a checkpoint does not store; by default the only mode with its number of channels.
         voxel: Edge of a voxel [m], 0.02 for a checkpoint. Must not contradict what the file stores.
         space: Embedding space of the output, by default the file's name. Must not contradict what the file stores.
 

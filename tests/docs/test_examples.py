@@ -1,7 +1,7 @@
 """Every shell and Python block of the README and the documentation runs, on a small version of the room.
 
-A block that cannot run here is preceded by `<!-- not run: reason -->`. Only options that would take minutes are changed,
-and the changes are listed.
+A block that cannot run here is preceded by `<!-- not run: reason -->`. Only options that would take minutes are
+changed (SHORTER).
 """
 
 import json
