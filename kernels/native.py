@@ -1,4 +1,4 @@
-"""What the innermost loops of the lane schedule share, in C++ with the compiler's vector types.
+"""Shared C++ of the innermost loops of the lane schedule, in the compiler's vector types.
 
 Warp builds these snippets into its CPU kernels as they stand. Written in Warp, what a loop carries from one step to the
 next would go through memory; here it stays in registers. Where AVX-512 has an instruction for a step it is used, and

@@ -34,7 +34,7 @@ MOMENTS = 6  # columns of a row: the moments of g, then colours, depth, |d mean|
 
 
 def row_columns(wide: bool, depth: bool, absolute: bool) -> tuple[int, int, int]:
-    """Where a row holds the depth and the first of |d mean|, and how many columns it has."""
+    """Column of the depth, first column of |d mean|, and number of columns of a row."""
     at_depth = MOMENTS + (0 if wide else 3)
     at_absolute = at_depth + int(depth)
     return at_depth, at_absolute, at_absolute + 2 * int(absolute)

@@ -1,4 +1,4 @@
-"""Which Gaussians contribute to which pixel: explicit lists of pairs, front to back. One thread per pixel.
+"""Explicit lists of (pixel, Gaussian) pairs, front to back. One thread per pixel.
 
 The lists are long, so they are counted first and written second; rendering never needs them.
 """

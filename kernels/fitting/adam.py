@@ -75,7 +75,7 @@ def count_steps(
     moves_out: wp.array[wp.vec2],  # [N] `waited_moves` of them
     factors_out: wp.array[wp.vec4],  # [N] that correct the bias of both means, and by which both fell while it waited
 ):
-    """Who takes this step: a Gaussian that changes a pixel has a gradient of its opacity or of its colour."""
+    """Count the steps: a Gaussian that changes a pixel has a gradient of its opacity or of its color."""
     i = base + wp.tid()
     v = sh[i, 0]
     seen = opacities[i] != 0.0 or v[0] != 0.0 or v[1] != 0.0 or v[2] != 0.0
@@ -176,7 +176,7 @@ def note_gradients(
     sums_out: wp.array[float],  # [N] of the length of the gradient in half images, added to
     views_out: wp.array[int],  # [N] added to
 ):
-    """What densification looks at: how much the loss wants a projected centre to move, on average over views."""
+    """Statistics for densification: gradient of the projected center, averaged over views."""
     i = base + wp.tid()
     if int(taken[i]) != SEEN:
         return

@@ -1,4 +1,4 @@
-"""What both lifting schedules share: ids per tile, sums per Gaussian, and the paper's centre mode."""
+"""Shared by both lifting schedules: ids per tile, sums per Gaussian, and the paper's center mode."""
 
 import warp as wp
 

@@ -72,7 +72,7 @@ class GaussianRasterizer(torch.nn.Module):
         self.raster_settings = raster_settings
 
     def markVisible(self, positions: Tensor) -> Tensor:
-        """Which points [N, 3] lie in front of the near plane, bool [N]."""
+        """Mask of the points [N, 3] in front of the near plane, bool [N]."""
         with torch.no_grad():
             view = self.raster_settings.viewmatrix
             return positions @ view[:3, 2].to(positions) + view[3, 2].to(positions) > NEAR

@@ -1,4 +1,4 @@
-"""How good semantics are: segmentation and localisation on the held-out views of the room."""
+"""Quality of semantics: segmentation and localization on the held-out views of the room."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ SMALLEST = 50  # an object with fewer pixels in a view is not looked for there
 
 @dataclass(frozen=True, eq=False)
 class Finding:
-    """Where a query was found in a view.
+    """Location of a query in a view.
 
     Attributes:
         name: The query.
@@ -41,7 +41,7 @@ class Finding:
 
 @dataclass(frozen=True, eq=False)
 class Measurement:
-    """What semantics are worth.
+    """Accuracy of semantics.
 
     Attributes:
         confusion: Of the furniture and the background, over the held-out views.
@@ -70,7 +70,7 @@ class Measurement:
 
     @property
     def localised(self) -> int:
-        """How many objects are found in the held-out view that shows most of them."""
+        """Number of objects found in the held-out view that shows most of them."""
         return sum(finding.hit for finding in self.best_sights)
 
 

@@ -111,7 +111,7 @@ def _cross(axis: Axes, place: tuple[float, float]) -> None:
 
 
 def _draw_key(axis: Axes, hits: int, count: int) -> None:
-    """What the marks mean, in the tile that is left over."""
+    """Legend of the marks, in the tile that is left over."""
     from matplotlib import colormaps
 
     axis.set_xlim(0, 1)

@@ -1,4 +1,4 @@
-"""What sources of 2D semantics have in common: what each kind takes and gives, and the spaces that never mix.
+"""Interfaces of all sources of 2D semantics, and their embedding spaces.
 
 The paper (Sec. III-B) knows three kinds of networks, which `compose` turns into feature maps: image-level ones
 (`ImageEncoder`), pixel-level ones (`PixelEncoder`) and instance-level ones (`InstanceEncoder`), each with a
@@ -67,7 +67,7 @@ class Masks:
 
 @dataclass(frozen=True, eq=False)
 class Instances:
-    """What an instance-level network found in an image.
+    """Instances found in one image.
 
     Attributes:
         boxes: x1, y1, x2, y2 [pixels of the image], float32 [K, 4].
@@ -161,11 +161,11 @@ class InstanceEncoder(Part, Protocol):
     """Finds things and names them, such as GroundingDINO or VLPart."""
 
     def find(self, view: View, image: Tensor) -> Instances:
-        """What an image, float32 [H, W, 3], shows."""
+        """Find the instances of an image, float32 [H, W, 3]."""
         ...
 
     def identity_of(self, view: View) -> str:
-        """What the answer depends on besides `identity` and the image: the content of files, or nothing."""
+        """Hash of what the map depends on besides `identity` and the image: the content of files, or nothing."""
         ...
 
 

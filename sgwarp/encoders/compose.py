@@ -46,7 +46,7 @@ def as_pixels(image: Tensor) -> NDArray[np.uint8]:
 
 
 class Composed:
-    """What the maps of all three rules have in common: they need the image, and ask their network for texts."""
+    """Base of the maps of all three rules: they need the image, and embed texts with their network."""
 
     needs_image = True
     space: str

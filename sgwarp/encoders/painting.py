@@ -15,7 +15,7 @@ MASKS_AT_ONCE = 64  # masks held as floating point numbers at a time
 
 
 def cover_sets(masks: Tensor) -> tuple[Tensor, Tensor]:
-    """Which sets of masks cover the pixels.
+    """Sets of masks that cover each pixel.
 
     Args:
         masks: bool [M, h, w].
@@ -95,7 +95,7 @@ def mask_means(masks: Tensor, features: Tensor) -> Tensor:
 
 
 def spread(masks: Tensor, rows: Tensor, columns: Tensor) -> Tensor:
-    """How much the readings at a mask's pixels take from each location of a coarser map, float32 [M, h, w].
+    """Interpolation weights of each mask's pixels on a coarser map, float32 [M, h, w].
 
     The transpose of interpolation: features [h, w, C] read at the pixels of a mask add up to the sum over ij of this
     times features_ij, and no map at the size of the masks is ever made.

@@ -34,7 +34,7 @@ def box_squares(boxes: Tensor, margin: float) -> NDArray[np.float64]:
 def cut_squares(
     image: NDArray[np.uint8], squares: NDArray[np.float64], side: int, outside: int = GREY
 ) -> NDArray[np.uint8]:
-    """What an image shows in some squares, resized, uint8 [B, side, side, 3]; `outside` where they reach
+    """Resized square crops of an image, uint8 [B, side, side, 3]; `outside` where they reach
     beyond it."""
     import cv2
 

@@ -135,7 +135,7 @@ def identity_of_weights(weights: nn.Module | Mapping[str, Tensor], beginnings: t
 
 @dataclass(frozen=True)
 class Preparation:
-    """How a model wants its images.
+    """Image preprocessing of a model.
 
     Attributes:
         mean, deviation: Of the values in [0, 1], per channel.

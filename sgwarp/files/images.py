@@ -42,7 +42,7 @@ def read_rgb(path: str | os.PathLike[str]) -> NDArray[np.uint8]:
 
 
 def read_alpha(path: str | os.PathLike[str]) -> NDArray[np.uint8] | None:
-    """How opaque the pixels of a photograph are, uint8 [H, W]; None if all are, or the format cannot tell.
+    """Alpha channel of an image, uint8 [H, W]; None if it has none or is opaque everywhere.
 
     Raises:
         InputError: The file is missing, cut short, or not an image.

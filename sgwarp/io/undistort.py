@@ -150,7 +150,7 @@ def _covers(lens: Lens, zoom: float) -> bool:
 
 @lru_cache(maxsize=2)  # 8 bytes a pixel each; the views of one camera come one after the other
 def _sampling_positions(lens: Lens) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
-    """Where in the photograph each pinhole pixel lies, OpenCV pixel coordinates, two float32 [H, W]."""
+    """Position of each pinhole pixel in the distorted image, OpenCV pixel coordinates, two float32 [H, W]."""
     import cv2
 
     build = cv2.fisheye.initUndistortRectifyMap if lens.fisheye else cv2.initUndistortRectifyMap

@@ -162,7 +162,7 @@ class _Lifting:
             raise InputError(f"view {view.stem}: feature map holds NaN or infinity at {bad} places; mark them invalid")
 
     def mean(self, views: int) -> Semantics:
-        """What has been summed, divided by its weight; the sums are used up."""
+        """The weighted mean; frees the sums."""
         if self.sums is None:
             raise InputError(f"no feature map for any of the {views} views; file names must match the view stems")
         weight, squared = self.sums.weight, self.sums.weight_squared

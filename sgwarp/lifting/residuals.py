@@ -1,4 +1,4 @@
-"""How far lifted features miss a 2D feature map when they are rendered back into its view."""
+"""The residual: difference between a 2D feature map and the lifted features rendered into its view."""
 
 from __future__ import annotations
 

@@ -73,7 +73,7 @@ def without_prefixes(state: dict[str, Tensor]) -> dict[str, Tensor]:
 
 
 def difference(state: dict[str, Tensor], net: MinkUNet) -> str:
-    """How a state dict misses a network, in one line; empty if it fits."""
+    """Differences between a state dict and a network, in one line; empty if it fits."""
     wanted = net.state_dict()
     missing = [name for name in wanted if name not in state]
     unknown = [name for name in state if name not in wanted]

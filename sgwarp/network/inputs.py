@@ -1,4 +1,4 @@
-"""What the network sees of a Gaussian, and which voxel it falls into."""
+"""Input features of the network, and the voxel of each Gaussian."""
 
 from __future__ import annotations
 

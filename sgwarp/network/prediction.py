@@ -19,7 +19,7 @@ from sgwarp.scene import Camera, Gaussians, Semantics
 
 @dataclass(frozen=True, eq=False)
 class Prediction:
-    """What the network makes of a scene, as the input of its last, linear layer.
+    """The network's output for a scene, as the input of its last, linear layer.
 
     That layer has 64 or 96 inputs whatever the size C of the embedding, so the hidden features say all there is to say:
     they are smaller, and cheaper to splat.

@@ -1,4 +1,4 @@
-"""How much of a scene the projection covers, and whether the network is needed at all."""
+"""Coverage of a scene by the projection, and whether the network is needed at all."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ TWO_VIEWS = 1.5  # effective views from which on a feature rests on more than on
 
 
 class ProjectionQuality(NamedTuple):
-    """How much of a scene the projection knows.
+    """Coverage and reliability of lifted semantics.
 
     Attributes:
         coverage: Share of the Gaussians that some view saw.

@@ -28,7 +28,7 @@ VERSION = 1
 
 @dataclass(frozen=True, eq=False)
 class SemanticNetwork:
-    """What predicts semantics from Gaussians (paper, Sec. III-C).
+    """The 3D semantic network, which predicts features from Gaussians (paper, Sec. III-C).
 
     Attributes:
         net: The U-Net.

@@ -43,7 +43,7 @@ class Group:
 
 
 def values_of(parameters: Tensor, form: str) -> Tensor:
-    """What is rendered for these parameters."""
+    """The rendered (activated) values of these parameters."""
     if form == "plain":
         return parameters
     return parameters.exp() if form == "logarithm" else parameters.sigmoid()
@@ -51,7 +51,7 @@ def values_of(parameters: Tensor, form: str) -> Tensor:
 
 @dataclass(frozen=True, eq=False)
 class Taken:
-    """Who takes a step.
+    """The Gaussians that take an optimizer step.
 
     Attributes:
         marks: 0 for those that wait, else 1, and 3 for those that the view has seen, uint8 [N].
@@ -74,7 +74,7 @@ class Taken:
 
     @property
     def count(self) -> int:
-        """How many take the step."""
+        """Number of Gaussians that take the step."""
         return int((self.marks > 0).sum())
 
 

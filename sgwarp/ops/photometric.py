@@ -1,4 +1,4 @@
-"""How far a rendering is from a photograph: mean absolute difference and structural similarity, with gradients."""
+"""Photometric loss between a rendering and an image: L1 and structural similarity, with gradients."""
 
 from __future__ import annotations
 

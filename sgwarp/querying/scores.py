@@ -34,7 +34,7 @@ def relevancy(
     canonical: Sequence[str] = CANONICAL,
     scale: float = 10.0,
 ) -> Tensor:
-    """How much better a text fits than any canonical phrase (Kerr et al., LERF, 2023), float32 [N, Q] in [0, 1].
+    """Relevancy of texts against canonical phrases (Kerr et al., LERF, 2023), float32 [N, Q] in [0, 1].
 
     The smallest, over the canonical phrases, of the first entry of softmax(scale * [cosine of the text, cosine of the
     phrase]); above 0.5 the text beats all of them. 0 where nothing was seen.
@@ -61,7 +61,7 @@ def standardise(scores: Tensor, seen: Tensor) -> Tensor:
 
 
 def evidence(scores: Tensor, semantics: Semantics) -> Tensor:
-    """How far scores [N, Q] stand out from the scene, trusted as far as the Gaussian was seen.
+    """Scores [N, Q] standardized over the scene and weighted by how well each Gaussian was seen.
 
     `standardise`, times w / (w + median w) with w the weight behind a Gaussian's feature: one that a single grazing
     pixel saw says little. 0 is the scene's mean, 1 its deviation; 0 where nothing was seen.
@@ -114,7 +114,7 @@ def class_votes(
     predicted: Semantics | None = None,
     ensemble: Ensemble = "max",
 ) -> Tensor:
-    """How much every Gaussian speaks for every class, float32 [N, Q]; 0 where nothing was seen.
+    """Per-Gaussian class scores, float32 [N, Q]; 0 where nothing was seen.
 
     For lifted label or id images the lifted shares themselves, of all labels if `classes` is None. In a text space:
 

@@ -1,4 +1,4 @@
-"""What the scores of the Gaussians look like from a camera: segmentation and localisation.
+"""Scores rendered into a view: segmentation and localization.
 
 The few score channels are splatted, never the features themselves. Gaussians that no view saw hide what lies behind
 them but have no say; a pixel where they prevail is unknown.
@@ -68,7 +68,7 @@ def segment(
     ensemble: Ensemble = "max",
     settings: RasterSettings | None = None,
 ) -> tuple[Tensor, Tensor]:
-    """Which class every pixel of a view shows.
+    """Segment a view: the class of every pixel.
 
     Args:
         gaussians: The scene.
@@ -155,7 +155,7 @@ def localize(
     box: int = 1,
     settings: RasterSettings | None = None,
 ) -> tuple[tuple[int, int], Tensor]:
-    """Where in a view a query scores best.
+    """Localize a query: the pixel of a view with the best score.
 
     Args:
         scores: Of one query, [N].

@@ -172,7 +172,7 @@ class _Cells:
         self.rows = 0
 
     def patches(self) -> _Patches:
-        """What all views have added up to; the sums are used up."""
+        """The fused patches of all views; frees the sums."""
         self._merge()
         ((key, sums, finest),) = self.waiting
         self.waiting = []

@@ -1,4 +1,4 @@
-"""What a posed RGB-D view shows: every pixel as a flat patch of surface in the world."""
+"""Posed RGB-D views as oriented surface patches, one per pixel, in world coordinates."""
 
 from __future__ import annotations
 

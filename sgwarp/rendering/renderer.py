@@ -77,7 +77,7 @@ def plan(
     features: Tensor | None = None,
     settings: RasterSettings | None = None,
 ) -> RenderPlan:
-    """What `render` would compute and what it would leave out, as `print` shows it.
+    """The render plan of a call of `render`: what it computes and what it leaves out. `print` shows it.
 
     Args:
         gaussians: As for `render`.

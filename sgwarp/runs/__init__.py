@@ -1,1 +1,1 @@
-"""How long work behaves: progress, log, interruption, random numbers."""
+"""Long runs: progress, log, interruption, random numbers."""

@@ -1,4 +1,4 @@
-"""What a run did, how long it took and how wrong it is, side by side in `run.json`."""
+"""The log of a run: stages, times and error figures, side by side in `run.json`."""
 
 from __future__ import annotations
 

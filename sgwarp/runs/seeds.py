@@ -19,6 +19,6 @@ def generator(seed: int, step: int, purpose: str) -> torch.Generator:
 
 
 def view_at(seed: int, step: int, count: int) -> int:
-    """Which of `count` photographs is looked at in a step: all of them in turn, in another order each time."""
+    """Index of the training image of a step, below `count`: a new permutation for each epoch."""
     turn, place = divmod(step, count)
     return int(torch.randperm(count, generator=generator(seed, turn, "views"))[place])

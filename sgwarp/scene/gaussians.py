@@ -77,7 +77,7 @@ class Gaussians:
         return math.isqrt(self.sh.shape[1]) - 1
 
     def _known(self, name: str, tensors: tuple[Tensor, ...], find: Callable[[], Any]) -> Any:
-        """What `find` says of the tensors, remembered until one of them is written to."""
+        """The cached result of `find`, until one of the tensors is written to."""
         version = version_of(*tensors)
         known = self.__dict__.get(f"_{name}")
         if known is None or known[0] != version:
@@ -120,7 +120,7 @@ class Gaussians:
 
     @property
     def non_finite(self) -> int:
-        """How many rows hold NaN or infinity; the renderer leaves them out."""
+        """Number of rows with NaN or infinity; the renderer leaves them out."""
         return len(self) - int(self.finite.sum())
 
     @property

@@ -1,4 +1,4 @@
-"""What gsplat's callers may pass: shapes, and the arguments that have no counterpart here."""
+"""Checks of arguments: shapes, and arguments of gsplat that are not supported."""
 
 from __future__ import annotations
 

@@ -34,7 +34,7 @@ RASTERIZE_MODES = ("classic", "antialiased")
 
 
 class RollingShutterType(Enum):
-    """How a sensor is read out; only GLOBAL, all at once, is supported."""
+    """Readout order of a sensor; only GLOBAL is supported."""
 
     ROLLING_TOP_TO_BOTTOM = 0
     ROLLING_LEFT_TO_RIGHT = 1
@@ -190,7 +190,7 @@ def _values(
     sh_degree: int | None,
     sparse: bool,
 ) -> list[Tensor]:
-    """What the visible splats of each image carry, [V, D]: the colours given, or those of their harmonics."""
+    """Values of the visible splats of each image, [V, D]: the given colors, or those of the harmonics."""
     trailing = 2 if sh_degree is None else 3
     shared = colors.ndim == len(images.batch_dims) + trailing
     source = images.scenes(colors) if shared else images.images(colors)

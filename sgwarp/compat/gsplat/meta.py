@@ -19,7 +19,7 @@ from sgwarp.ops.splatting.tiles import TileLists
 
 @dataclass(frozen=True)
 class Images:
-    """How the images of a call are counted: image i = b * cameras + c, N Gaussians in each scene b."""
+    """Numbering of the images of a call: image i = b * cameras + c, N Gaussians in each scene b."""
 
     batch_dims: tuple[int, ...]
     batches: int

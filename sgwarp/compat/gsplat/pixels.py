@@ -33,7 +33,7 @@ def isect_tiles(
     image_ids: Tensor | None = None,
     gaussian_ids: Tensor | None = None,
 ) -> tuple[Tensor, Tensor, Tensor]:
-    """Which tiles the bounding boxes of splats touch, as `gsplat.isect_tiles` does.
+    """Tiles that the bounding boxes of splats touch, as in `gsplat.isect_tiles`.
 
     Args:
         means2d: Centres [pixels], [..., N, 2], or [nnz, 2] if packed.
@@ -164,7 +164,7 @@ def rasterize_to_pixels(
 
 
 def _writer(rows: Tensor) -> Callable[[Tensor], None]:
-    """What writes values into rows of a table."""
+    """A function that writes values into rows of a table."""
 
     def write(values: Tensor) -> None:
         rows.copy_(values)
@@ -192,7 +192,7 @@ def rasterize_to_indices_in_range(
     isect_offsets: Tensor,
     flatten_ids: Tensor,
 ) -> tuple[Tensor, Tensor, Tensor]:
-    """Which splats contribute to which pixels, as `gsplat.rasterize_to_indices_in_range` does.
+    """Pairs of contributing splats and pixels, as in `gsplat.rasterize_to_indices_in_range`.
 
     Args:
         range_start, range_end: Batches of tile_size^2 entries of every tile's list to look at; the end is excluded.

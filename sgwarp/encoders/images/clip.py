@@ -110,7 +110,7 @@ class JointEncoder:
         return normalize(tokens, dim=-1).reshape(height // self.patch, width // self.patch, -1).cpu()
 
     def _inputs(self, images: Tensor) -> dict[str, Any]:
-        """What the vision tower takes: images, or with SigLIP 2 the patches of an image of any shape."""
+        """Inputs of the vision tower: images, or with SigLIP 2 the patches of an image of any shape."""
         values = self.preparation.normalise(images)
         if self.kind != "siglip2":
             return {"pixel_values": values, "interpolate_pos_encoding": images.shape[2:] != (self.side, self.side)}

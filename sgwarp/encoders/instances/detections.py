@@ -1,4 +1,4 @@
-"""Which boxes of a detector count: good enough, within the image, and no repetition of a better one."""
+"""Filter of a detector's boxes: score, image bounds, non-maximum suppression."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from sgwarp.encoders.masks.sam import best_boxes
 
 @dataclass(frozen=True)
 class DetectorSettings:
-    """Which boxes count.
+    """Settings of a detector's boxes.
 
     Attributes:
         least_score: Least score of a box.

@@ -62,7 +62,7 @@ class VLPartFiles:
         return hashlib.sha256(read_bytes(self._path(view))).hexdigest()
 
     def find(self, view: View, image: torch.Tensor) -> Instances:
-        """What the file of the view holds.
+        """Instances from the file of the view.
 
         Raises:
             InputError: It is missing, damaged, or boxes and masks do not fit the image.

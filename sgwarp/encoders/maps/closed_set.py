@@ -81,7 +81,7 @@ class ClosedSet:
 
 
 def class_shares(classes: Tensor, masks: Tensor) -> Tensor:
-    """How much every class claims every pixel, float32 [K, h, w]: over the queries, class probability times mask.
+    """Class scores of every pixel, float32 [K, h, w]: summed over the queries, class probability times mask.
 
     Args:
         classes: Logits of Q queries over K classes and "nothing", [Q, K + 1].

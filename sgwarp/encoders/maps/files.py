@@ -109,7 +109,7 @@ class FileMaps:
         return bool(self._candidates(view.stem))
 
     def _find(self, stem: str) -> tuple[Kind, Path]:
-        """What kind of map a view has, and its (first) file."""
+        """Kind of a view's map, and its (first) file."""
         found = self._candidates(stem)
         if not found:
             raise MissingMap(f"{self.folder}: holds no map of view {stem}")

@@ -33,7 +33,7 @@ CLASSES = {
 
 @dataclass(frozen=True)
 class SamSettings:
-    """What "everything" means.
+    """Settings of the "segment everything" mode.
 
     Attributes:
         points: Points along each side of the grid.
@@ -114,7 +114,7 @@ class Sam:
         return torch.cat(masks)
 
     def _look(self, image: Tensor) -> tuple[Any, tuple[int, int]]:
-        """What the prompts are decoded from, and the part of the square input that the image fills, (height, width)."""
+        """Image embedding for the prompts, and the part of the square input that the image fills, (height, width)."""
         keeps_shape = self.kind == "sam"  # and leaves the rest of the square empty
         inside = fitted(image.shape[0], image.shape[1], self.side, 1) if keeps_shape else (self.side, self.side)
         images = self.preparation.resize(channels_first(image, self.device), *inside)
@@ -169,7 +169,7 @@ def without_repetitions(masks: Masks, overlap: float, by_rank: bool = False) -> 
 
 
 def best_boxes(boxes: Tensor, overlap: float, groups: Tensor | None = None) -> Tensor:
-    """Which boxes, [K, 4] from the best to the worst, repeat no better one of their group, bool [K]."""
+    """Non-maximum suppression per group: boxes [K, 4], best first, that repeat no better one, bool [K]."""
     if not 0 < overlap <= 1:
         raise InputError(f"overlap: expected an IoU in (0, 1], got {overlap}")
     boxes = boxes.to(torch.float32)

@@ -57,7 +57,7 @@ class ClipSeg:
             )
 
     def encode_pixels(self, image: Tensor) -> Tensor:
-        """How much each pixel looks like each phrase, in [0, 1], float32 [h, w, Q]."""
+        """Similarity of each pixel and each phrase, in [0, 1], float32 [h, w, Q]."""
         images = self.preparation.resize(channels_first(image, self.device), self.side, self.side)
         values = self.preparation.normalise(images)
         shares = []

@@ -145,7 +145,7 @@ class _TensorsOnly(pickle.Unpickler):
 
 
 class _TensorPickle:
-    """What torch.load takes for the pickle module."""
+    """Replacement of the pickle module for torch.load."""
 
     Unpickler = _TensorsOnly
     __name__ = "tensors only"

@@ -25,7 +25,7 @@ ORDER_BAND = 2e-6
 
 @dataclass(frozen=True, eq=False)
 class Patches:
-    """What the oracle sees in patches of a view.
+    """The oracle's rendering of patches of a view.
 
     Attributes:
         corners: (left, top) of each patch [pixels].

@@ -20,7 +20,7 @@ MARK = "●"  # on the Pareto front
 
 @dataclass(frozen=True)
 class Stability:
-    """What one extreme scene gave in one schedule."""
+    """Result of one extreme scene in one schedule."""
 
     extreme: Extreme
     schedule: str

@@ -94,7 +94,7 @@ class MinkUNet(nn.Module):
             self.add_module(name, module)
 
     def hidden(self, x: SparseTensor) -> SparseTensor:
-        """What the last, linear layer is given: 64 or 96 channels for every voxel, whatever the embedding's size."""
+        """Input of the last, linear layer: 64 or 96 channels per voxel, whatever the size of the embedding."""
         x = relu(self.bn0(self.conv0p1s1(x)))
         beside = []
         for conv, norm, block in self._down:

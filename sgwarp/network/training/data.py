@@ -83,7 +83,7 @@ class Example:
 
 
 def reliability(semantics: Semantics) -> Tensor:
-    """How far a lifted feature can be trusted, float32 [N] from 0 (not seen) to 1.
+    """Reliability of lifted features, float32 [N] from 0 (not seen) to 1.
 
     w / (w + median w) times v / (v + 1), with w its weight and v the views that share it: a single grazing pixel says
     little, and one view alone may be wrong.

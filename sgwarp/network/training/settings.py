@@ -1,4 +1,4 @@
-"""What a training run is told, and what it writes down."""
+"""Settings of a training run."""
 
 from __future__ import annotations
 

@@ -110,7 +110,7 @@ Kind = tuple[str, int, tuple[str, ...] | None]  # space, channels and labels of 
 
 
 def _kind(semantics: Semantics, name: str, first: Kind | None = None) -> Kind:
-    """What a scene's semantics are, which must be what the first one's were."""
+    """Space, channels and labels of a scene's semantics; the same for all scenes."""
     kind = semantics.space, semantics.features.shape[1], semantics.labels
     for what, mine, wanted in zip(("space", "channels", "labels"), kind, first or kind, strict=True):
         if mine != wanted:
@@ -336,5 +336,5 @@ def _generator(*numbers: int) -> torch.Generator:
 
 
 def state_path(out: str | os.PathLike[str]) -> Path:
-    """Where a run that writes the network `out` keeps its state."""
+    """Path of the state of a run that writes the network `out`."""
     return Path(out).with_suffix(".state.pt")

@@ -38,7 +38,7 @@ def intersect_boxes(
     tile_rows: int,
     sort: bool = True,
 ) -> tuple[Tensor, Tensor, Tensor]:
-    """Which tiles the bounding box of each splat touches.
+    """Tiles that the bounding box of each splat touches.
 
     Args:
         means2d: Centres [pixels], [M, 2].

@@ -23,7 +23,7 @@ FACTOR_UNIT = math.sqrt(0.5 * math.log2(math.e))  # makes the exponent of a foot
 
 @dataclass(frozen=True)
 class ProjectionSettings:
-    """How Gaussians become splats.
+    """Settings of the projection.
 
     Attributes:
         camera_model: "pinhole", "ortho" or "fisheye" (equidistant, without distortion).

@@ -34,7 +34,7 @@ HIDDEN_LEVEL = -1.0e4  # log2 of an opacity that reaches no pixel
 
 @dataclass(frozen=True, eq=False)
 class ListedSplats:
-    """Which splats each 16 x 16 tile of an image composites, front to back.
+    """Tile lists of splats given from outside: the splats of each 16 x 16 tile, front to back.
 
     Attributes:
         listed: Row of the splat, tile by tile, int32 [n].
@@ -47,7 +47,7 @@ class ListedSplats:
 
 @dataclass(eq=False)
 class SplatJob:
-    """What compositing is asked beside the tensors, and what it reports.
+    """Options of a compositing call, and the statistics it returns.
 
     Attributes:
         width, height: Of the image [pixels].

@@ -152,7 +152,7 @@ def _check_fields(means: Tensor, quats: Tensor, scales: Tensor, opacities: Tenso
 
 @dataclass(eq=False)
 class _Request:
-    """What is no tensor, and what comes back beside the images."""
+    """Arguments of a call that are not tensors, and results that are not images."""
 
     camera: Camera
     settings: RasterSettings

@@ -48,7 +48,7 @@ class ImageGradients:
 
 @dataclass(frozen=True, eq=False)
 class SplatGradients:
-    """What compositing passes back to the splats; rows of Gaussians that reached no tile are zero.
+    """Gradients of the splats from compositing; zero for Gaussians that reached no tile.
 
     Attributes:
         sums: Moments of g under 1, u, v, u^2, u v, v^2 (see kernels/projection_backward.py), then others, [N, 16].

@@ -1,4 +1,4 @@
-"""Which Gaussians make up a pixel: the strongest contributors with their weights, without lists of all pairs."""
+"""The strongest contributors of each pixel with their blending weights, without lists of all pairs."""
 
 from __future__ import annotations
 

@@ -26,7 +26,7 @@ WIDE_PASS = 4  # slices of 16 channels that one walk over the tiles composites; 
 
 @dataclass(frozen=True, eq=False)
 class Rendering:
-    """What a camera sees.
+    """Images of one rendering.
 
     Attributes:
         features: sum of alpha T x plus the background, float32 [H, W, C].

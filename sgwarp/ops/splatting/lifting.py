@@ -32,7 +32,7 @@ SLICE_BYTES = 512 * 2**20  # at most this much for slices that have to be brough
 
 @dataclass(eq=False)
 class LiftSums:
-    """What the views have added up so far.
+    """Running sums over the lifted views.
 
     Attributes:
         slices: Sum of weighted features, channels in slices of 16 padded with zeros, float32 [N, S, 16].

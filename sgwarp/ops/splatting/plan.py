@@ -1,4 +1,4 @@
-"""What a rendering computes, and what it leaves out because neither the scene nor the request needs it."""
+"""The render plan: stages that a rendering runs, and stages that scene and request do not need."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ Values = Literal["colors", "features", "nothing"]
 
 @dataclass(frozen=True)
 class RenderPlan:
-    """Which kernels a rendering runs; `print(plan)` says it in words. `plan_render` derives it.
+    """The kernels that a rendering runs; `print(plan)` lists them. `plan_render` derives it.
 
     Leaving out never changes what was asked for: the same image comes out bit for bit, only sooner.
 

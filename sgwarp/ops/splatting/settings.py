@@ -10,7 +10,7 @@ from sgwarp.errors import InputError
 
 @dataclass(frozen=True)
 class RasterSettings:
-    """What the rasterizer approximates, and how far.
+    """Approximations of the rasterizer, each with its default.
 
     Attributes:
         alpha_min: A Gaussian is left out of a pixel where its opacity is below this; 2^-16 to 1.

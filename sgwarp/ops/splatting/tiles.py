@@ -33,7 +33,7 @@ class Projected:
     depths: Tensor  # float32 [N] z [m], valid where visible
 
     def counts(self) -> Tensor:
-        """How many Gaussians have each status, int64; on CUDA nobody waits for it until it is read."""
+        """Number of Gaussians per status, int64; on CUDA the host waits only when it is read."""
         if self.status.device.type == "cuda":
             names = torch.arange(len(projection.STATUS_NAMES), device=self.status.device)
             return (self.status[:, None] == names).sum(dim=0)
@@ -41,14 +41,14 @@ class Projected:
 
 
 def culled(counts: Tensor) -> dict[str, int]:
-    """How many Gaussians were left out, by reason, from `Projected.counts`."""
+    """Number of Gaussians that were left out, by reason, from `Projected.counts`."""
     named = dict(zip(projection.STATUS_NAMES, counts.tolist(), strict=True))
     return {name: count for name, count in named.items() if count and name != "visible"}
 
 
 @dataclass(frozen=True)
 class TileLists:
-    """Which splats each tile of one view composites; scratch, valid until the next view, unless they were kept.
+    """Tile lists of one view; scratch memory, valid until the next view unless kept.
 
     A place is a position in the lists, an entry an intersection (one splat in one tile) counted splat by splat, a rank
     a place in the depth order.
@@ -76,11 +76,11 @@ class TileLists:
         return as_splats(self.memory)
 
     def arrays(self) -> list[wp.array]:
-        """What compositing and lifting kernels read: offsets, listed, splats."""
+        """Inputs of compositing and lifting kernels: offsets, listed, splats."""
         return [view(self.offsets, wp.int32), view(self.listed, wp.int32), self.splats]
 
     def sums(self) -> list[wp.array]:
-        """What kernels read that add up the rows of each Gaussian: order, entries, places."""
+        """Inputs of the kernels that sum the rows of each Gaussian: order, entries, places."""
         return [view(t, wp.int32) for t in (self.order, self.entries, self.places)]
 
 

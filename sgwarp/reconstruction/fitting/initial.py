@@ -1,4 +1,4 @@
-"""What a fit starts from: Gaussians at points of structure from motion, or at random in what the cameras see."""
+"""Initial Gaussians: at points from structure from motion, or at random inside the camera frusta."""
 
 from __future__ import annotations
 

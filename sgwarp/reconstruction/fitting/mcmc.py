@@ -86,7 +86,7 @@ class MarkovChain:
 
 
 def shared_opacity_and_scale(opacities: Tensor, copies: Tensor) -> tuple[Tensor, Tensor]:
-    """What keeps the picture when a Gaussian becomes several in one place (Kheradmand et al. 2024, eq. 9).
+    """Opacity and scale that keep the rendering when a Gaussian is split into copies (Kheradmand et al. 2024, eq. 9).
 
     Args:
         opacities: [M].

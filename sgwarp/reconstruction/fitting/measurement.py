@@ -1,4 +1,4 @@
-"""Where a fit stood at a step."""
+"""Quality of a fit at one step."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 @dataclass(frozen=True)
 class Measurement:
-    """Where a run stood.
+    """Quality at one step.
 
     Attributes:
         step: Steps taken.

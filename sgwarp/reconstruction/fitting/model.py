@@ -62,7 +62,7 @@ class Model:
         return len(self.steps)
 
     def __getitem__(self, name: str) -> Tensor:
-        """What is rendered."""
+        """The activated values that are rendered."""
         return self.groups[name].values
 
     def gaussians(self) -> Gaussians:

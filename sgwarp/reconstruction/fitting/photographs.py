@@ -163,7 +163,7 @@ def require_overlap(photographs: Sequence[Photograph], means: Tensor, held_out: 
 
 
 def _shown(camera: Camera, means: Tensor) -> Tensor:
-    """Which points lie in the image, bool [N]."""
+    """Mask of the points inside the image, bool [N]."""
     pose = camera.world_to_camera.to(means)
     points = means @ pose[:3, :3].T + pose[:3, 3]
     pixels = points @ camera.K.to(means).T

@@ -1,4 +1,4 @@
-"""What a fit looks like: a contact sheet of held-out views, and quality over time."""
+"""Pictures of a fit: a contact sheet of held-out views, and quality over time."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What a fit can be told, with the values of the 3DGS reference implementation as defaults."""
+"""Settings of a fit; the defaults are those of the 3DGS reference implementation."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ REFERENCE_STEPS = 30_000  # to which the reference implementations state their s
 
 @dataclass(frozen=True)
 class FitSettings:
-    """How a scene is fitted.
+    """Settings of a fit.
 
     Rates and thresholds are those of the 3DGS reference implementation (Kerbl et al. 2023), and for `mcmc` those of
     Kheradmand et al. 2024 as gsplat has them. Both state their schedules for 30,000 steps; here they shrink in

@@ -52,7 +52,7 @@ MEMORY = 0.99  # of the loss that is reported
 
 @dataclass(frozen=True, eq=False)
 class Fitted:
-    """What a fit gives.
+    """Result of a fit.
 
     Attributes:
         gaussians: The scene.

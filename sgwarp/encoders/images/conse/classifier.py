@@ -79,7 +79,7 @@ class ImageClassifier:
         return LogitMap(logits.cpu(), (height, width), self.first)
 
     def _features(self, images: NDArray[np.uint8]) -> Tensor:
-        """What is pooled before the last layer, [B, 1280, h, w]."""
+        """Feature map before pooling, [B, 1280, h, w]."""
         pixels = torch.from_numpy(images).to(self.device).permute(0, 3, 1, 2)  # channels last in memory
         with torch.no_grad():
             return self.network.extract_features((pixels.to(torch.float32) - MEAN) / DEVIATION)

@@ -21,7 +21,7 @@ from sgwarp.encoders.regions import box_squares, cut_squares, mask_boxes
 
 @dataclass(frozen=True)
 class ConseSettings:
-    """What the encoder looks at. Lengths and areas in pixels refer to an image of `side`.
+    """Settings of the encoder. Lengths and areas in pixels refer to an image of `side`.
 
     Attributes:
         map_sides: Longest side that the image is resized to for each pass over all locations [pixels].
