@@ -12,6 +12,8 @@ import warp as wp
 from sgwarp.kernels.gaussian import LEVEL_SLACK, Splat
 from sgwarp.kernels.transmittance import Lanes
 
+BATCH = wp.constant(32)  # fragments of a tile that the lanes walk row by row
+
 
 @wp.struct
 class Seen:
@@ -121,12 +123,15 @@ HELPERS = """
 """
 
 
-def snippet(body: str, **constants: object) -> str:
-    """The C++ of a loop, with its options filled in; what they switch off the compiler removes."""
-    body = HELPERS + body
-    for name, value in {"LEVEL_SLACK": f"{float(LEVEL_SLACK)}f", **constants}.items():
-        body = body.replace(name, str(int(value)) if isinstance(value, bool) else str(value))
-    return body
+def snippet(body: str, **constants: bool | int | float) -> str:
+    """The C++ of a loop. Its options come first as `constexpr`; what they switch off the compiler removes."""
+    shared = {"LEVEL_SLACK": float(LEVEL_SLACK), "BATCH": int(BATCH)}
+    return "".join(_declaration(name, value) for name, value in {**shared, **constants}.items()) + HELPERS + body
+
+
+def _declaration(name: str, value: bool | int | float) -> str:
+    kind, text = ("bool", str(int(value))) if isinstance(value, bool) else (type(value).__name__, repr(value))
+    return f"    [[maybe_unused]] constexpr {kind} {name} = {text}{'f' if kind == 'float' else ''};\n"
 
 
 @cache

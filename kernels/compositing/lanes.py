@@ -12,7 +12,7 @@ import warp as wp
 from sgwarp.kernels.binning import TILE, Fragment
 from sgwarp.kernels.compositing.loops import gather_batch, row_walk, write_row
 from sgwarp.kernels.gaussian import Splat
-from sgwarp.kernels.native import Seen
+from sgwarp.kernels.native import BATCH, Seen
 from sgwarp.kernels.projection.forward import Knobs
 from sgwarp.kernels.transmittance import (
     HALF_ROW,
@@ -27,7 +27,6 @@ from sgwarp.kernels.transmittance import (
 
 wp.set_module_options(LANE_OPTIONS)
 
-BATCH = wp.constant(32)  # fragments that are walked row by row
 CLOSE_EVERY = wp.constant(32)  # fragments between two looks at which rows are closed
 
 

@@ -9,10 +9,10 @@ from functools import cache
 import warp as wp
 
 from sgwarp.kernels.binning import TILE
-from sgwarp.kernels.compositing.lanes import BATCH, open_tile, write_last
+from sgwarp.kernels.compositing.lanes import open_tile, write_last
 from sgwarp.kernels.compositing.loops import REACHING, gather_batch
 from sgwarp.kernels.gaussian import Splat
-from sgwarp.kernels.native import Seen, snippet
+from sgwarp.kernels.native import BATCH, Seen, snippet
 from sgwarp.kernels.projection.forward import Knobs
 from sgwarp.kernels.transmittance import LANE_OPTIONS, LANES, Lanes
 
@@ -22,7 +22,7 @@ PASS = 16  # channels accumulated in registers at a time
 
 PREFETCH = """
     for (int b = 0; b < count; ++b) {
-        const auto* const x = features.data + batch.data[slot * 32 + b].splat.gaussian * features.shape[1];
+        const auto* const x = features.data + batch.data[slot * BATCH + b].splat.gaussian * features.shape[1];
         for (int s = 0; s < SLICES; ++s) __builtin_prefetch(x + first_slice + s);
     }
 """
@@ -33,13 +33,13 @@ FORWARD = (
     if (!left) return true;
     const int planes = state.shape[2];
     Row* const row_state = reinterpret_cast<Row*>(state.data + (slot * 16 + row) * planes);
-    Row T = row_state[0], last = zero, weights[32] __attribute__((aligned(64)));
-    const float* owners[32];
+    Row T = row_state[0], last = zero, weights[BATCH] __attribute__((aligned(64)));
+    const float* owners[BATCH];
     if (RECORD) last = row_state[planes - 1];
     int count = 0;
     for (; left; left &= left - 1) {
         const int b = __builtin_ctz(left);
-        const auto& seen = batch.data[slot * 32 + b];
+        const auto& seen = batch.data[slot * BATCH + b];
         const Row w = take_seen(seen, row, knobs, T);
         if (RECORD) {
             const float place = order + b;
@@ -110,7 +110,7 @@ def feature_walk(slices: int, record: bool) -> wp.Function:
         row: int,
         order: int,  # of the batch's first fragment in the tile's list
         first_slice: int,
-        batch: wp.array2d[Seen],  # [slots, 32]
+        batch: wp.array2d[Seen],  # [slots, BATCH]
         reached: wp.array2d[int],  # [slots, 16]
         features: wp.array3d[Lanes],  # [N, S, 1]
         knobs: Knobs,

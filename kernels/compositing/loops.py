@@ -13,25 +13,25 @@ from sgwarp.kernels.transmittance import LaneIds, Lanes
 # The splats of a batch as the tile sees them; rows_of[b] has a bit for each row that splat b reaches.
 GATHER = """
     unsigned short* const rows_of = reinterpret_cast<unsigned short*>(reached.data + slot * 16);
-    const int count = stop - start < 32 ? stop - start : 32;
+    const int count = stop - start < BATCH ? stop - start : BATCH;
     for (int b = 0; b < count; ++b) {
         const int ahead = start + b + AHEAD;
         __builtin_prefetch(splats.data + listed.data[ahead < stop ? ahead : stop - 1]);
         const auto& s = splats.data[listed.data[start + b]];
-        auto& seen = batch.data[slot * 32 + b];
+        auto& seen = batch.data[slot * BATCH + b];
         Row middle, top;
         rows_of[b] = see(s, x0, y0, knobs, middle, top);
         reinterpret_cast<Row&>(seen.middle) = middle;
         reinterpret_cast<Row&>(seen.top) = top;
         reinterpret_cast<Row&>(seen.splat) = reinterpret_cast<const Row&>(s);
     }
-    for (int b = count; b < 32; ++b) rows_of[b] = 0;
+    for (int b = count; b < BATCH; ++b) rows_of[b] = 0;
 """
 
 # Bit b: splat b of the batch reaches the row.
 REACHING = """
-    typedef unsigned short Shorts __attribute__((ext_vector_type(32), aligned(4)));
-    using Bits = bool __attribute__((ext_vector_type(32)));
+    typedef unsigned short Shorts __attribute__((ext_vector_type(BATCH), aligned(4)));
+    using Bits = bool __attribute__((ext_vector_type(BATCH)));
     const Shorts rows_of = *reinterpret_cast<const Shorts*>(reached.data + slot * 16);
     const Shorts here = rows_of & (unsigned short)(1 << row);
     unsigned left = __builtin_bit_cast(unsigned, __builtin_convertvector(here != (unsigned short)0, Bits));
@@ -62,8 +62,8 @@ FORWARD = (
     if (RECORD) last = row_state[planes - 1];
     for (; left; left &= left - 1) {
         const int b = __builtin_ctz(left);
-        const auto& s = batch.data[slot * 32 + b].splat;
-        const Row before = T, w = take_seen(batch.data[slot * 32 + b], row, knobs, T);
+        const auto& s = batch.data[slot * BATCH + b].splat;
+        const Row before = T, w = take_seen(batch.data[slot * BATCH + b], row, knobs, T);
         red += w * s.color[0];
         green += w * s.color[1];
         blue += w * s.color[2];
@@ -249,7 +249,7 @@ def gather_batch(
     listed: wp.array[int],  # [I]
     splats: wp.array[Splat],  # [V]
     knobs: Knobs,
-    batch: wp.array2d[Seen],  # [slots, 32] out
+    batch: wp.array2d[Seen],  # [slots, BATCH] out
     reached: wp.array2d[int],  # [slots, 16] out: for each of them 16 bits, the rows that it reaches
 ): ...
 
@@ -276,7 +276,7 @@ def row_walk(depth: bool, record: bool) -> wp.Function:
         slot: int,
         row: int,
         order: int,  # of the batch's first fragment in the tile's list
-        batch: wp.array2d[Seen],  # [slots, 32]
+        batch: wp.array2d[Seen],  # [slots, BATCH]
         reached: wp.array2d[int],  # [slots, 16]
         knobs: Knobs,
         state: wp.array3d[Lanes],  # [slots, 16, planes] as in `color_walk`
@@ -300,7 +300,7 @@ def read_tile(
 @cache
 def fragment_replay(wide: bool, depth: bool, absolute: bool, min_passed: float) -> wp.Function:
     """Device function that differentiates one fragment of a tile and steps the tile's state to the front of it."""
-    constants = {"WIDE": wide, "DEPTH": depth, "ABSOLUTE": absolute, "MIN_PASSED": f"{min_passed}f"}
+    constants = {"WIDE": wide, "DEPTH": depth, "ABSOLUTE": absolute, "MIN_PASSED": float(min_passed)}
 
     @wp.func_native(snippet(BACKWARD, **constants))
     def replay_fragment(

@@ -38,7 +38,7 @@ UPDATE = """
 """
 
 
-@wp.func_native(snippet(UPDATE, BETA_1=f"{float(BETA_1)}f", BETA_2=f"{float(BETA_2)}f", EPSILON=f"{float(EPSILON)}f"))
+@wp.func_native(snippet(UPDATE, BETA_1=float(BETA_1), BETA_2=float(BETA_2), EPSILON=float(EPSILON)))
 def update_row(
     i: int,
     moves: wp.array[wp.vec2],

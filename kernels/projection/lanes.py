@@ -262,10 +262,10 @@ BACKWARD = (
 )
 
 CONSTANTS = {
-    "MIN_NORM2": f"{float(MIN_QUAT_NORM2)}f",
-    "UNIT": f"{float(UNIT)}f",
-    "LOG2_E": f"{float(LOG2_E)}f",
-    "LN_2": f"{float(LN_2)}f",
+    "MIN_NORM2": float(MIN_QUAT_NORM2),
+    "UNIT": float(UNIT),
+    "LOG2_E": float(LOG2_E),
+    "LN_2": float(LN_2),
     "SEEN": int(SEEN),
     "VISIBLE": int(VISIBLE),
     "NON_FINITE": int(NON_FINITE),

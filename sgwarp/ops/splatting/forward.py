@@ -12,7 +12,7 @@ from sgwarp.errors import InputError
 from sgwarp.kernels.compositing import block as compositing_block
 from sgwarp.kernels.compositing import lanes as compositing_lanes
 from sgwarp.kernels.compositing import lanes_features as compositing_lanes_features
-from sgwarp.kernels.native import Seen
+from sgwarp.kernels.native import BATCH, Seen
 from sgwarp.kernels.transmittance import Lanes
 from sgwarp.ops.launcher import fresh, get_threads, launch, launch_blocks, scratch, view
 from sgwarp.ops.splatting import tiles
@@ -224,7 +224,7 @@ def lane_scratch(name: str, rows: int, planes: int, device: torch.device) -> wp.
 
 def batch_scratch(device: torch.device) -> list[wp.array]:
     """Scratch of the lane schedule for a batch of fragments and the rows they reach."""
-    threads, batch = get_threads(), int(compositing_lanes.BATCH)
+    threads, batch = get_threads(), int(BATCH)
     size = wp.types.type_size_in_bytes(Seen)
     memory = scratch("lanes batch", threads * batch * size // 4, torch.int32, device)
     layout = {"dtype": Seen, "shape": (threads, batch), "capacity": 4 * len(memory)}
