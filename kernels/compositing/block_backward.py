@@ -1,9 +1,9 @@
 """Backward pass of compositing, block schedule (CUDA): 256 threads own a tile and replay it from its last fragment.
 
-The mathematics is that of `compositing_lanes_backward.py`. For a batch of 16 fragments each thread computes w and g at
+The mathematics is that of `lanes_backward.py`. For a batch of 16 fragments each thread computes w and g at
 its own pixel, then thread (fragment, column) sums one column of the fragment's row over the 256 pixels. The sum goes to
 the Gaussian by one atomic addition per (tile, fragment, column) or, in the ordered variant, to the row of its place in
-the lists; `projection_backward.sum_intersections` adds the rows up in a fixed order.
+the lists; `projection/backward.py`'s `sum_intersections` adds the rows up in a fixed order.
 """
 
 from functools import cache

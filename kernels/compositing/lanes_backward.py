@@ -8,7 +8,7 @@ the same value of all that lies behind it, per unit of light that reaches it,
 which starts from the background: B = dL/dT. Nothing is stored per fragment and pixel: T is recovered by division, and
 alpha = 2^(level - u^2 - v^2) again by the forward's own device functions. What the geometry needs are the moments of
 g = w (c - B) under 1, u, v, u^2, u v, v^2. In these whitened coordinates the moments stay of order one, so that needles
-lose no digits on the way back to three dimensions (`projection_backward.py`).
+lose no digits on the way back to three dimensions (`projection/backward.py`).
 
 Along a row only u changes, and from row to row u and v change by b and c. So a row adds g, d g and d^2 g to three
 vectors, d its distance to the middle one of the rows at work, and the six moments follow once per fragment. Counted
@@ -46,7 +46,7 @@ def make_composite_backward(wide: bool, depth: bool, absolute: bool) -> wp.Kerne
 
     Args:
         wide: The values are `features` of any number of channels instead of the splats' three colours. Their
-            gradient is the image's gradient lifted: here, where there is room for it, or by `lifting_lanes.py`.
+            gradient is the image's gradient lifted: here, where there is room for it, or by `lifting/lanes.py`.
         depth: The sum of alpha T z has a gradient too.
         absolute: Also sum the magnitudes of each pixel's gradient of the projected mean.
     """

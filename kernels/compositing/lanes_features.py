@@ -1,6 +1,6 @@
 """Front-to-back compositing of feature vectors, lane schedule (CPU): passes of 16 or 64 channels.
 
-Fragments come in batches, as in `compositing_lanes.py`. For a row of 16 pixels the weights of a batch are computed
+Fragments come in batches, as in `lanes.py`. For a row of 16 pixels the weights of a batch are computed
 first; then they are multiplied by the features as small matrices are, 16 channels by 16 pixels in registers.
 """
 

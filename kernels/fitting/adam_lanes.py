@@ -1,4 +1,4 @@
-"""The step of `optimizing.py` for many plain columns, lane schedule (CPU): 16 at a time, in C++ (`native.py`)."""
+"""The step of `adam.py` for many plain columns, lane schedule (CPU): 16 at a time, in C++ (`native.py`)."""
 
 import warp as wp
 
@@ -24,13 +24,13 @@ UPDATE = """
         Row second = reinterpret_cast<const Row*>(second_out.data)[at];
         Row parameter = reinterpret_cast<const Row*>(parameters_out.data)[at];
         if (moves_0 > 0.0f) {
-            parameter -= rate * first * moves_0 / (__builtin_elementwise_sqrt(second) + EPSILON);
+            parameter -= rate * first * moves_0 / (__builtin_elementwise_sqrt(second) + ADAM_EPSILON);
             first *= decay_1;
             second *= decay_2;
         }
         first += (1.0f - BETA_1) * (g - first);
         second += (1.0f - BETA_2) * (g * g - second);
-        parameter -= rate * first * by_first / (__builtin_elementwise_sqrt(second * by_second) + EPSILON);
+        parameter -= rate * first * by_first / (__builtin_elementwise_sqrt(second * by_second) + ADAM_EPSILON);
         reinterpret_cast<Row*>(first_out.data)[at] = first;
         reinterpret_cast<Row*>(second_out.data)[at] = second;
         reinterpret_cast<Row*>(parameters_out.data)[at] = parameter;
@@ -38,7 +38,7 @@ UPDATE = """
 """
 
 
-@wp.func_native(snippet(UPDATE, BETA_1=float(BETA_1), BETA_2=float(BETA_2), EPSILON=float(EPSILON)))
+@wp.func_native(snippet(UPDATE, BETA_1=float(BETA_1), BETA_2=float(BETA_2), ADAM_EPSILON=float(EPSILON)))
 def update_row(
     i: int,
     moves: wp.array[wp.vec2],

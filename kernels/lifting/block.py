@@ -2,7 +2,7 @@
 
 For a batch of 16 fragments each thread computes the weight of its own pixel, then thread (fragment, channel)
 multiplies the 16 x 256 weights by the 256 x 16 features. Its sum goes to the Gaussian by one atomic addition per
-(tile, fragment, channel) or, in the ordered variant, to the row of its place in the lists; `lifting.sum_rows` adds the
+(tile, fragment, channel) or, in the ordered variant, to the row of its place in the lists; `shared.sum_rows` adds the
 rows up in a fixed order.
 """
 

@@ -2,7 +2,7 @@
 
 The renderer is a matrix A with one entry alpha T per (pixel, Gaussian); lifting applies its transpose to a feature
 map. The thread that owns a tile sums each fragment's contribution over the tile's pixels in registers and writes one
-row for each place of its list; `lifting.py` adds up the rows of each Gaussian. No two threads write the same memory, so
+row for each place of its list; `shared.py` adds up the rows of each Gaussian. No two threads write the same memory, so
 the result has the same bits for any number of threads.
 """
 

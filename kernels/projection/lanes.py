@@ -1,6 +1,6 @@
 """Gaussian -> splat, lane schedule (CPU): `project_gaussians` for 16 Gaussians at a time, in C++ (`native.py`).
 
-The maths and its order are those of `projection.py` and `projection_backward.py`, where they are explained; the tests
+The maths and its order are those of `forward.py` and `backward.py`, where they are explained; the tests
 compare them splat by splat. Comparisons are exact about NaN and infinity, as there.
 """
 
