@@ -147,12 +147,14 @@ def write_ply(gaussians: Gaussians, path: str | os.PathLike[str]) -> None:
     write_elements(path, {"vertex": rows})
 
 
-def columns(path: str | os.PathLike[str], rows: NDArray[Any], names: Sequence[str]) -> NDArray[np.float32]:
-    """Gather the named columns as float32 [N, len(names)]; a list column is an InputError."""
+def columns(
+    path: str | os.PathLike[str], rows: NDArray[Any], names: Sequence[str], kind: Any = np.float32
+) -> NDArray[Any]:
+    """Gather the named columns as float32 (or another `kind`) [N, len(names)]; a list column is an InputError."""
     lists = [name for name in names if rows.dtype[name].hasobject]
     if lists:
         raise InputError(f"{path}: column {lists[0]} holds lists, expected one number per row")
-    values = np.empty((len(rows), len(names)), dtype=np.float32)
+    values = np.empty((len(rows), len(names)), dtype=kind)
     # A double beyond float32 becomes infinity, a signalling NaN a quiet one: both are counted as non-finite.
     with np.errstate(over="ignore", invalid="ignore"):
         for start in range(0, len(rows), ROWS_PER_BLOCK):

@@ -169,12 +169,3 @@ def _multiply(a: Any, b: Any) -> Any:
     )
     return np.stack(product, axis=1)
 
-
-def join_gaussians(parts: list[Gaussians]) -> Gaussians:
-    """Several scenes as one, in this order; the highest degree of the harmonics is kept."""
-    from sgwarp.scene import SH_COUNTS
-
-    most = max(SH_COUNTS.index(part.sh.shape[1]) for part in parts)
-    padded = [torch.nn.functional.pad(part.sh, (0, 0, 0, SH_COUNTS[most] - part.sh.shape[1])) for part in parts]
-    fields = [torch.cat([getattr(part, name) for part in parts]) for name in ("means", "quats", "scales", "opacities")]
-    return Gaussians(*fields, torch.cat(padded))

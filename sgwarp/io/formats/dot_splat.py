@@ -16,8 +16,8 @@ import os
 import numpy as np
 
 from sgwarp.errors import InputError
-from sgwarp.io.atomic import atomic_path
-from sgwarp.io.files import read_bytes
+from sgwarp.files.atomic import atomic_path
+from sgwarp.files.access import read_bytes
 from sgwarp.io.formats.axes import PLY_AXES, change_axes
 from sgwarp.io.ply import build_gaussians, host_arrays
 from sgwarp.scene import Gaussians

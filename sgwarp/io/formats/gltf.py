@@ -20,12 +20,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sgwarp.errors import InputError
-from sgwarp.io.atomic import atomic_path
-from sgwarp.io.formats.axes import PLY_AXES, GLTF_AXES, change_axes, join_gaussians, move_gaussians
+from sgwarp.files.atomic import atomic_path
+from sgwarp.io.formats.axes import PLY_AXES, GLTF_AXES, change_axes, move_gaussians
 from sgwarp.io.formats.gltf_buffers import Document, read_document
 from sgwarp.io.formats.spz import gaussians_from_spz
 from sgwarp.io.ply import build_gaussians, host_arrays
-from sgwarp.scene import Gaussians
+from sgwarp.scene import Gaussians, join_gaussians
 
 EXTENSION = "KHR_gaussian_splatting"
 SPZ_EXTENSIONS = ("KHR_gaussian_splatting_compression_spz_2", "KHR_gaussian_splatting_compression_spz")

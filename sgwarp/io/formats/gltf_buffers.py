@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sgwarp.errors import InputError
-from sgwarp.io.files import read_bytes
+from sgwarp.files.access import read_bytes
 
 MAGIC, JSON, BIN = b"glTF", 0x4E4F534A, 0x004E4942
 COMPONENTS = {5120: "i1", 5121: "u1", 5122: "<i2", 5123: "<u2", 5125: "<u4", 5126: "<f4"}

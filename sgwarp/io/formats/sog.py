@@ -25,7 +25,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sgwarp.errors import InputError
-from sgwarp.io.files import read_bytes, reading
+from sgwarp.files.access import read_bytes, reading
 from sgwarp.io.formats.axes import PLY_AXES, change_axes
 from sgwarp.io.ply import build_gaussians
 from sgwarp.scene import Gaussians
