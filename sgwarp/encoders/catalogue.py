@@ -174,7 +174,7 @@ KINDS = (
         "DIR",
         "files:features?layout=chw",
         "",
-        {"layout": "text", "levels": "text"},
+        {"layout": "text", "levels": "text", "straight": "text"},
     ),
     Kind(
         "openscene",

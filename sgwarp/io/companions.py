@@ -60,8 +60,8 @@ class Companions:
     def _names(self, view: View, ending: str) -> Iterator[str]:
         """Relative names that the file may have, the surest first."""
         yield view.stem + ending
-        for tail in _tails(view):
-            if self._tails[tail.lower()] == 1:
+        for index, tail in enumerate(_tails(view)):
+            if index == 0 or self._tails[tail.lower()] == 1:
                 yield tail + ending
                 yield _without_suffix(tail) + ending
 

@@ -111,7 +111,8 @@ def _read_gzip(path: str | os.PathLike[str], data: bytes) -> tuple[Header, list[
         # Deflate makes at most 1032 bytes of one: a larger claim is false, and nothing is allocated for it.
         if total > 1032 * len(data):
             raise InputError(f"{path}: claims {count} Gaussians, which {len(data)} bytes cannot hold; it is damaged")
-        body = inflater.decompress(inflater.unconsumed_tail, total) if total else b""
+        body = inflater.decompress(inflater.unconsumed_tail, total)
+        inflater.decompress(inflater.unconsumed_tail, 1)  # reaches the checksum
     except zlib.error as error:
         raise InputError(f"{path}: its gzip stream is damaged ({error}); copy or download it again") from None
     if len(body) < total:

@@ -2,9 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import replace
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -12,9 +11,9 @@ import torch
 from torch import Tensor
 
 from sgwarp.errors import InputError
-from sgwarp.files.images import read_ids
 from sgwarp.ops.neighbors import mean_squared_neighbor_distance
 from sgwarp.reconstruction.depth import SH_C0
+from sgwarp.reconstruction.fitting.belongings import depth_from_folder as depth_from_folder
 from sgwarp.reconstruction.fitting.photographs import Photograph, camera_extent
 from sgwarp.reconstruction.fitting.settings import FitSettings
 from sgwarp.runs.seeds import generator
@@ -28,7 +27,6 @@ VISIBLE = 1 / 255  # opacity from which on a Gaussian changes a pixel
 LEAST_POINTS = 4  # that three neighbours need
 RANDOM_COUNT = 50_000
 NEAREST, FARTHEST = 0.2, 4.0  # of random points [extent of the cameras]
-MILLIMETRE = 1e-3  # [m], the unit of depth images
 
 
 def gaussians_from_points(
@@ -126,21 +124,3 @@ def adapted(gaussians: Gaussians, settings: FitSettings) -> Gaussians:
             f"all Gaussians to start from are below an opacity of {VISIBLE:.4f}: no photograph would move them"
         )
     return replace(gaussians, sh=gaussians.sh[:, : SH_COUNTS[settings.sh_degree]])
-
-
-def depth_from_folder(folder: Path) -> Callable[[View], Any]:
-    """Depth of a view [m], [H, W], 0 where there is none: {stem}.npy in metres or {stem}.png in millimetres.
-
-    What is returned raises InputError if there is neither, or it cannot be read.
-    """
-
-    def depth(view: View) -> Any:
-        numbers = folder / f"{view.stem}.npy"
-        if not numbers.is_file():
-            return read_ids(folder / f"{view.stem}.png").astype(np.float32) * np.float32(MILLIMETRE)
-        try:
-            return np.load(numbers, allow_pickle=False)
-        except (ValueError, EOFError):
-            raise InputError(f"{numbers}: is not an array that NumPy can read; write it again") from None
-
-    return depth

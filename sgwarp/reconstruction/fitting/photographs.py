@@ -13,7 +13,8 @@ import torch
 from torch import Tensor
 
 from sgwarp.errors import InputError
-from sgwarp.files.images import read_alpha, read_ids
+from sgwarp.files.images import read_alpha
+from sgwarp.reconstruction.fitting.belongings import masks_from_folder as masks_from_folder
 from sgwarp.runs.progress import Report
 from sgwarp.scene import Camera, View
 
@@ -61,7 +62,7 @@ def read_photographs(
     device: str | torch.device = "cpu",
     progress: Report | None = None,
 ) -> list[Photograph]:
-    """Read all photographs.
+    """Read all photographs; those that cannot be used are left out, with a logged notice.
 
     Args:
         views: Posed photographs.
@@ -69,24 +70,35 @@ def read_photographs(
         masks: Which pixels of a view count, [H, W] of its photograph, zero for those that do not; or None for all.
 
     Raises:
-        InputError: A photograph is missing, cannot be read, or does not have its camera's size; a mask does not fit.
+        InputError: A view has no photograph, or none of the photographs can be used.
     """
     if downscale < 1:
         raise InputError(f"downscale: expected a whole number of at least 1, got {downscale}")
     report = progress or (lambda done, total, name: None)
-    photographs = []
+    photographs: list[Photograph] = []
+    failed: list[InputError] = []
     report(0, len(views), "")
     for done, view in enumerate(views, start=1):
-        photographs.append(_read(view, downscale, masks, device))
+        if view.image_path is None:
+            raise InputError(f"view {view.stem}: has no photograph; a scene is fitted to photographs")
+        try:
+            photographs.append(_read(view, downscale, masks, device))
+        except InputError as error:
+            failed.append(error)
         report(done, len(views), view.stem)
+    if failed and not photographs:
+        raise failed[0]
+    if failed:
+        logger.warning(
+            "left out %d of %d photographs that cannot be used, first: %s", len(failed), len(views), failed[0]
+        )
     return photographs
 
 
 def _read(view: View, downscale: int, masks: Masks | None, device: str | torch.device) -> Photograph:
     import cv2
 
-    if view.image_path is None:
-        raise InputError(f"view {view.stem}: has no photograph; a scene is fitted to photographs")
+    assert view.image_path is not None
     pixels = (view.image().numpy() * 255.0).round().astype(np.uint8)
     alpha: Any = read_alpha(view.image_path)
     if alpha is not None and view.undistort is not None:
@@ -115,27 +127,7 @@ def _read(view: View, downscale: int, masks: Masks | None, device: str | torch.d
     return Photograph(view.stem, camera, torch.from_numpy(pixels).to(device), known, opaque, Path(view.image_path))
 
 
-def masks_from_folder(folder: Path, views: Sequence[View]) -> Masks:
-    """Masks named like the views, {stem}.png; zero is left out, and a view without a mask counts as a whole.
-
-    Raises:
-        InputError: No view has a mask there.
-    """
-    paths = {view.stem: folder / f"{view.stem}.png" for view in views}
-    missing = [path.name for path in paths.values() if not path.is_file()]
-    if len(missing) == len(paths):
-        raise InputError(f"{folder}: holds no mask of any view; expected files such as {views[0].stem}.png")
-    if missing:
-        logger.warning("%s: %d of %d views have no mask (%s, ...)", folder, len(missing), len(paths), missing[0])
-
-    def mask(view: View) -> Any:
-        path = paths.get(view.stem)
-        return read_ids(path) if path is not None and path.is_file() else None
-
-    return mask
-
-
-def require_enough(views: Sequence[View]) -> None:
+def require_enough(views: Sequence[View | Photograph]) -> None:
     """Raise InputError unless there are enough photographs to fit a scene to."""
     if len(views) < LEAST_VIEWS:
         names = f" ({', '.join(view.stem for view in views)})" if views else ""

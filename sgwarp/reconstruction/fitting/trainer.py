@@ -128,6 +128,7 @@ def fit(
             [_near_enough(p, extent) for p in read_photographs(v, downscale=downscale, masks=given, device=device)]
             for v in (views, held_out)
         )
+    require_enough(photographs)
     run = _Run(settings, photographs, shown, extent, torch.device(device), log)
     with log.stage("start"):
         if resume:
