@@ -128,6 +128,12 @@ def _describe_json(path: str | os.PathLike[str]) -> str:
     return "is no scene of Gaussians"
 
 
+def find_writer(path: str | os.PathLike[str]) -> SceneFormat | None:
+    """The format that the name of an output asks for, or None."""
+    name = os.fspath(path).lower()
+    return next((form for form in FORMATS if form.write and name.endswith(form.suffixes)), None)
+
+
 def save_gaussians(gaussians: Gaussians, path: str | os.PathLike[str], axes: str | None = None) -> None:
     """Write a scene in the format that its name ends in: .ply, .compressed.ply, .spz, .splat or .glb.
 
@@ -142,8 +148,7 @@ def save_gaussians(gaussians: Gaussians, path: str | os.PathLike[str], axes: str
     Raises:
         InputError: The name ends in something else, the scene is empty, or the file cannot be written.
     """
-    name = os.fspath(path).lower()
-    form = next((form for form in FORMATS if form.write and name.endswith(form.suffixes)), None)
+    form = find_writer(path)
     if form is None or form.write is None:
         raise InputError(f"{path}: scenes are written as {WRITTEN}; change the name")
     form.write(gaussians, path, axes=parse_axes(axes) if axes is not None else form.axes)
