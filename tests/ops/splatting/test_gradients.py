@@ -460,3 +460,24 @@ def test_huge_coefficients_stay_finite_colours(make_scene):
     sh[7], sh[9] = 3e38, -3e38
     spoiled = Gaussians(gaussians.means, gaussians.quats, gaussians.scales, gaussians.opacities, sh)
     assert not bool(torch.isnan(rasterize(spoiled, camera).features).any())
+
+
+def test_colors_and_features_in_one_pass():
+    """Harmonics and features together are what they are apart, and so are their gradients."""
+    gaussians, camera = SCENES["degree_3"]() if "degree_3" in SCENES else next(iter(SCENES.values()))()
+    fields = (gaussians.means, gaussians.quats, gaussians.scales, gaussians.opacities)
+    features = torch.rand(len(gaussians), 5, generator=torch.Generator().manual_seed(0))
+    shape = (camera.world_to_camera.float(), camera.K.float(), camera.width, camera.height)
+    leaves = [t.clone().requires_grad_() for t in (*fields, gaussians.sh, features)]
+    both = rasterize(*leaves[:4], *shape, sh=leaves[4], features=leaves[5]).features
+    apart = [t.clone().requires_grad_() for t in (*fields, gaussians.sh, features)]
+    colors = rasterize(*apart[:4], *shape, sh=apart[4]).features
+    others = rasterize(*apart[:4], *shape, features=apart[5]).features
+    assert both.shape[2] == 8
+    torch.testing.assert_close(both, torch.cat([colors, others], dim=2), rtol=0, atol=2e-5)
+    weights = torch.rand(both.shape, generator=torch.Generator().manual_seed(1))
+    (both * weights).sum().backward()
+    ((colors * weights[..., :3]).sum() + (others * weights[..., 3:]).sum()).backward()
+    for name, one, two in zip(("means", "quats", "scales", "opacities", "sh", "features"), leaves, apart, strict=True):
+        scale = two.grad.abs().max().item()
+        torch.testing.assert_close(one.grad, two.grad, rtol=1e-3, atol=1e-4 * scale, msg=lambda m, n=name: f"{n}: {m}")
