@@ -464,15 +464,19 @@ def test_huge_coefficients_stay_finite_colours(make_scene):
 
 def test_colors_and_features_in_one_pass():
     """Harmonics and features together are what they are apart, and so are their gradients."""
-    gaussians, camera = SCENES["degree_3"]() if "degree_3" in SCENES else next(iter(SCENES.values()))()
-    fields = (gaussians.means, gaussians.quats, gaussians.scales, gaussians.opacities)
-    features = torch.rand(len(gaussians), 5, generator=torch.Generator().manual_seed(0))
-    shape = (camera.world_to_camera.float(), camera.K.float(), camera.width, camera.height)
-    leaves = [t.clone().requires_grad_() for t in (*fields, gaussians.sh, features)]
-    both = rasterize(*leaves[:4], *shape, sh=leaves[4], features=leaves[5]).features
-    apart = [t.clone().requires_grad_() for t in (*fields, gaussians.sh, features)]
-    colors = rasterize(*apart[:4], *shape, sh=apart[4]).features
-    others = rasterize(*apart[:4], *shape, features=apart[5]).features
+    rng = torch.Generator().manual_seed(0)
+    means = torch.rand(60, 3, generator=rng) * torch.tensor([3.0, 2.0, 3.0]) + torch.tensor([-1.5, -1.0, 2.0])
+    quats = torch.randn(60, 4, generator=rng)
+    scales = torch.rand(60, 3, generator=rng) * 0.3 + 0.02
+    fields = (means, quats, scales, torch.rand(60, generator=rng) * 0.9 + 0.05, torch.randn(60, 16, 3, generator=rng))
+    fields = (*fields, torch.rand(60, 5, generator=rng))
+    K = torch.tensor([[50.0, 0, 20], [0, 50.0, 15], [0, 0, 1]])
+    shape = (torch.eye(4), K, 40, 30)
+    leaves = [t.clone().requires_grad_() for t in fields]
+    both = rasterize_differentiable(*leaves[:4], *shape, sh=leaves[4], features=leaves[5]).features
+    apart = [t.clone().requires_grad_() for t in fields]
+    colors = rasterize_differentiable(*apart[:4], *shape, sh=apart[4]).features
+    others = rasterize_differentiable(*apart[:4], *shape, features=apart[5]).features
     assert both.shape[2] == 8
     torch.testing.assert_close(both, torch.cat([colors, others], dim=2), rtol=0, atol=2e-5)
     weights = torch.rand(both.shape, generator=torch.Generator().manual_seed(1))
