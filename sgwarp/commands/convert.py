@@ -31,8 +31,8 @@ class Convert(Options):
 
     axes: str | None = None
     """Directions of the input's axes x, y, z, such as rdf (right, down, forward) or rub (right, up, back). If not
-    given, what its format says: rdf for .ply, .splat and .sog, rub for .spz, luf for glTF. Several tools write .spz with
-    the axes of .ply: if the scene comes out upside down, say rdf."""
+    given, what its format says: rdf for .ply, .splat and .sog, rub for .spz, luf for glTF. Several tools write .spz
+    with the axes of .ply: if the scene comes out upside down, say rdf."""
 
     out_axes: str | None = None
     """Directions of the output's axes; if not given, what its format says."""

@@ -66,8 +66,8 @@ class SceneOptions(Options):
     """The trained scene: .ply, .spz, .splat, .glb or .sog."""
 
     axes: str | None = None
-    """Directions of the scene file's axes x, y, z, such as rdf or rub; if not given, what its format says: rdf for .ply,
-    .splat and .sog, rub for .spz, luf for .glb."""
+    """Directions of the scene file's axes x, y, z, such as rdf or rub; if not given, what its format says: rdf for
+    .ply, .splat and .sog, rub for .spz, luf for .glb."""
 
     def load_scene(self, log: RunLog) -> Gaussians:
         """The scene on the chosen device.

@@ -76,9 +76,7 @@ def read_colmap(path: str | os.PathLike[str], image_folder: str = "images", phot
     return views
 
 
-def _usable(
-    record: ImageRecord, lenses: dict[int, Lens | InputError], folder: Path | None, left_out: LeftOut
-) -> bool:
+def _usable(record: ImageRecord, lenses: dict[int, Lens | InputError], folder: Path | None, left_out: LeftOut) -> bool:
     """Whether an image has a camera, a pose and a photograph; if not, why is noted.
 
     Raises:
@@ -106,7 +104,11 @@ def _say_models(path: Path, model: Path) -> None:
     if len(models) > 1:
         sizes = ", ".join(f"{other.name} with {count_images(other)}" for other in models)
         logging.getLogger("sgwarp").warning(
-            "%s: holds %d models (%s images); the one with most images is read, %s", path, len(models), sizes, model.name
+            "%s: holds %d models (%s images); the one with most images is read, %s",
+            path,
+            len(models),
+            sizes,
+            model.name,
         )
 
 

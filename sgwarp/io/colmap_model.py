@@ -46,10 +46,7 @@ def read_cameras(folder: Path) -> dict[int, Lens | InputError]:
     for camera_id, model, width, height, values in (
         _cameras_binary(path) if path.suffix == ".bin" else _cameras_text(path)
     ):
-        try:
-            lenses[camera_id] = _lens(f"{path}: camera {camera_id}", model, width, height, values)
-        except InputError as error:
-            lenses[camera_id] = error
+        lenses[camera_id] = _lens_or_error(f"{path}: camera {camera_id}", model, width, height, values)
     return lenses
 
 
@@ -137,6 +134,13 @@ def _model_file(folder: Path, name: str) -> Path:
     raise InputError(f"{folder}: has neither {name}.bin nor {name}.txt; export the sparse model with COLMAP")
 
 
+def _lens_or_error(where: str, model: str, width: int, height: int, values: tuple[float, ...]) -> Lens | InputError:
+    try:
+        return _lens(where, model, width, height, values)
+    except InputError as error:
+        return error
+
+
 def _lens(where: str, model: str, width: int, height: int, values: tuple[float, ...]) -> Lens:
     model = model.upper()
     if model not in COLMAP_MODELS:
@@ -201,8 +205,8 @@ def _cameras_binary(path: Path) -> Iterator[tuple[int, str, int, int, tuple[floa
         if not 0 <= number < len(MODEL_NAMES):
             # How many parameters it has is not known, so what follows cannot be read either.
             raise InputError(
-                f"{path}: camera {camera_id}: model number {number} is not known (0 to {len(MODEL_NAMES) - 1} are); run "
-                "COLMAP's image_undistorter, which writes PINHOLE cameras"
+                f"{path}: camera {camera_id}: model number {number} is not known (0 to {len(MODEL_NAMES) - 1} are); "
+                "run COLMAP's image_undistorter, which writes PINHOLE cameras"
             )
         model = MODEL_NAMES[number]
         yield camera_id, model, width, height, data.take(f"{PARAMETER_COUNTS[model]}d")

@@ -41,7 +41,9 @@ class LeftOut:
                 log.warning("%s: left out %d %s %s, first %s", self.source, len(names), self.unit, reason, names[0])
         if own:
             count = sum(len(self._names[reason]) for reason in own)
-            log.warning("%s: left out %d %s that cannot be used, first: %s", self.source, count, self.unit, own[0][1:-1])
+            log.warning(
+                "%s: left out %d %s that cannot be used, first: %s", self.source, count, self.unit, own[0][1:-1]
+            )
 
     @property
     def first_error(self) -> str | None:

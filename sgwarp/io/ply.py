@@ -179,8 +179,9 @@ def read_ply(path: str | os.PathLike[str]) -> Gaussians:
 def write_ply(gaussians: Gaussians, path: str | os.PathLike[str]) -> None:
     """Write a scene with the columns of the reference implementation, binary little-endian float32.
 
-    Columns that the scene was read with and that are none of them are written back, in their own types. Opacities 0 and 1 become logits -110 and 110 and a scale of 0 the logarithm -110, which read back exactly; all
-    other values read back to a relative 1e-6.
+    Columns that the scene was read with and that are none of them are written back, in their own types.
+    Opacities 0 and 1 become logits -110 and 110 and a scale of 0 the logarithm -110, which read back exactly; all other
+    values read back to a relative 1e-6.
 
     Raises:
         InputError: The scene is empty or the file cannot be written.
@@ -237,7 +238,7 @@ def build_gaussians(
 ) -> Gaussians:
     """Gaussians from arrays in the order of its fields; says how many rows are not finite."""
     tensors = (torch.from_numpy(np.ascontiguousarray(field, np.float32)) for field in fields)
-    gaussians = Gaussians(*tensors, extras)  # type: ignore[misc]
+    gaussians = Gaussians(*tensors, extras=extras)
     if gaussians.non_finite:
         logging.getLogger("sgwarp").warning(
             "%s: %d of %d Gaussians hold NaN or infinity; they are kept, and never rendered",

@@ -13,8 +13,8 @@ from numpy.typing import NDArray
 
 from sgwarp.errors import InputError
 from sgwarp.files.access import read_bytes
-from sgwarp.io.colors import rgb_names, unit_colors
 from sgwarp.io.colmap_model import find_model, read_points
+from sgwarp.io.colors import rgb_names, unit_colors
 from sgwarp.io.ply import COLOUR, POSITION, columns, read_elements
 
 PLY_NAMES = ("points3D.ply", "sparse_pc.ply", "point_cloud.ply")  # beside a transforms.json that names none
@@ -56,8 +56,9 @@ def load_points(path: str | os.PathLike[str]) -> Points:
     if not finite.any():
         raise InputError(f"{source}: holds no finite points; export them again, or start without any")
     if not finite.all():
-        left = len(finite) - int(finite.sum())
-        logging.getLogger("sgwarp").warning("%s: left out %d of %d points: not finite", source, left, len(finite))
+        logging.getLogger("sgwarp").warning(
+            "%s: left out %d of %d points: not finite", source, int((~finite).sum()), len(positions)
+        )
     return positions[finite], colours[finite].clip(0, 1)
 
 

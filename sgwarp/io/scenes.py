@@ -111,7 +111,9 @@ def find_format(path: str | os.PathLike[str]) -> SceneFormat:
         return form
     if name.endswith(".json"):
         raise InputError(f"{path}: {_describe_json(path)}")
-    raise InputError(f"{path}: is not a valid PLY file, nor a scene of another format that is read ({_read_suffixes()})")
+    raise InputError(
+        f"{path}: is not a valid PLY file, nor a scene of another format that is read ({_read_suffixes()})"
+    )
 
 
 def _read_suffixes() -> str:

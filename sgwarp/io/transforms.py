@@ -14,8 +14,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sgwarp.errors import InputError
-from sgwarp.files.exif import UPRIGHT
 from sgwarp.files.access import read_bytes
+from sgwarp.files.exif import UPRIGHT
 from sgwarp.files.images import read_size
 from sgwarp.io.lens_models import COLMAP_MODELS, LensModel
 from sgwarp.io.photographs import LeftOut, fit_photograph, say_orientations
@@ -29,7 +29,7 @@ COEFFICIENTS: dict[LensModel, tuple[str, ...]] = {
     "fisheye": ("k1", "k2", "k3", "k4"),
     "fov": ("omega",),
     "thin_prism_fisheye": ("k1", "k2", "p1", "p2", "k3", "k4", "sx1", "sy1"),
-    "rad_tan_thin_prism_fisheye": tuple("k0 k1 k2 k3 k4 k5 p0 p1 s0 s1 s2 s3".split()),
+    "rad_tan_thin_prism_fisheye": tuple(["k0", "k1", "k2", "k3", "k4", "k5", "p0", "p1", "s0", "s1", "s2", "s3"]),
     "division": ("k",),
     "eucm": ("alpha", "beta"),
 }
@@ -98,8 +98,9 @@ def read_transforms(path: str | os.PathLike[str], photographs: bool = True) -> l
         first = left_out.first(MISSING)
         raise InputError(
             left_out.first_error
-            or f"{path}: none of {len(meta['frames'])} frames can be used: {left_out.count(MISSING)} photographs do not "
-            f"exist (first {path.parent / first if first else '-'}), {left_out.count(UNPOSED)} poses hold NaN or infinity"
+            or f"{path}: none of {len(meta['frames'])} frames can be used: {left_out.count(MISSING)} photographs do "
+            f"not exist (first {path.parent / first if first else '-'}), {left_out.count(UNPOSED)} poses hold NaN or "
+            "infinity"
         )
     left_out.say()
     say_orientations(path, used)
@@ -114,14 +115,17 @@ def _view(
     name = frame["file_path"]
     where = f"{path}: frame {index} ({name})"
     sized = all(key in frame or key in meta for key in ("w", "h"))
-    lens, orientation = _lens(where, frame, meta, read_size(image) if image is not None and not sized else None), UPRIGHT
+    lens, orientation = (
+        _lens(where, frame, meta, read_size(image) if image is not None and not sized else None),
+        UPRIGHT,
+    )
     if image is not None and sized:
         lens, orientation = fit_photograph(lens, image)
-    belongings = {key: _belonging(path, frame, key) for key in BELONGINGS}
+    mask, depth = (_belonging(path, frame, key) for key in BELONGINGS)
     unit = frame.get(DEPTH_UNIT, meta.get(DEPTH_UNIT, MILLIMETER))
     if isinstance(unit, bool) or not isinstance(unit, (int, float)) or not 0 < unit < MAX_NUMBER:
         raise InputError(f"{where}: '{DEPTH_UNIT}' must be a positive number of meters, got {unit!r}")
-    listed = Listed(name, image, orientation, *belongings.values(), float(unit))
+    listed = Listed(name, image, orientation, mask, depth, float(unit))
     return pinhole_view(where, stem, lens, pose, listed), orientation
 
 

@@ -80,8 +80,6 @@ def moved_views(views: Sequence[View], matrix: NDArray[np.float64]) -> list[View
         pose = torch.eye(4, dtype=torch.float64)
         pose[:3, :3] = view.camera.world_to_camera[:3, :3] @ rotation.T
         pose[:3, 3] = -pose[:3, :3] @ (linear @ view.camera.position + shift)
-        camera = replace(
-            view.camera, world_to_camera=pose, near=view.camera.near * scale, far=view.camera.far * scale
-        )
+        camera = replace(view.camera, world_to_camera=pose, near=view.camera.near * scale, far=view.camera.far * scale)
         moved.append(replace(view, camera=camera))
     return moved

@@ -44,7 +44,7 @@ class Gaussians:
     scales: Tensor
     opacities: Tensor
     sh: Tensor
-    extras: Mapping[str, NDArray[Any]] | None = None
+    extras: Any = None  # Mapping[str, NDArray] or None
 
     def __post_init__(self) -> None:
         put = object.__setattr__
@@ -157,7 +157,7 @@ class Gaussians:
         return self._map(lambda t: t[index], {name: column[rows] for name, column in self.extras.items()})
 
     def _map(self, change: Callable[[Tensor], Tensor], extras: Mapping[str, NDArray[Any]] | None) -> Gaussians:
-        return Gaussians(*(change(getattr(self, name)) for name in FIELDS), extras)
+        return Gaussians(*(change(getattr(self, name)) for name in FIELDS), extras=extras)
 
 
 def join_gaussians(parts: Sequence[Gaussians]) -> Gaussians:
@@ -167,4 +167,4 @@ def join_gaussians(parts: Sequence[Gaussians]) -> Gaussians:
     fields = [torch.cat([getattr(part, name) for part in parts]) for name in FIELDS[:-1]]
     names = set.intersection(*(set(part.extras or {}) for part in parts))
     extras = {name: np.concatenate([(part.extras or {})[name] for part in parts]) for name in sorted(names)}
-    return Gaussians(*fields, torch.cat(padded), extras or None)
+    return Gaussians(*fields, torch.cat(padded), extras=extras or None)

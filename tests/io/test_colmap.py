@@ -221,7 +221,9 @@ def test_singular_intrinsics(dataset, form):
         read_colmap(dataset([camera], [image(camera=4)], form))
 
 
-@pytest.mark.parametrize(("factor", "size"), [(2, (1643, 2473)), (4, (822, 1237)), (4, (821, 1236)), (8, (411, 618)), (3.3, (996, 1499))])
+@pytest.mark.parametrize(
+    ("factor", "size"), [(2, (1643, 2473)), (4, (822, 1237)), (4, (821, 1236)), (8, (411, 618)), (3.3, (996, 1499))]
+)
 def test_smaller_photographs_scale_the_camera(dataset, tmp_path, factor, size):
     """Sizes as in Mip-NeRF 360 (4946 x 3286), rounded up or down by the tool that made them."""
     camera = (1, "PINHOLE", 4946, 3286, [4000.0, 4100.0, 2473.0, 1643.0])

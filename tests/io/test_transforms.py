@@ -232,7 +232,9 @@ def test_files_that_a_frame_names(dataset, tmp_path, caplog):
     (tmp_path / "masks").mkdir()
     (tmp_path / "masks" / "0.png").write_bytes(b"")
     own = {"mask_path": "masks/0.png", "depth_file_path": "gone.png"}
-    path = dataset([frame("0.png", mask_path="masks/0.png"), frame("1.png", **own)], **SHARED, train_filenames=["0.png"])
+    path = dataset(
+        [frame("0.png", mask_path="masks/0.png"), frame("1.png", **own)], **SHARED, train_filenames=["0.png"]
+    )
     with caplog.at_level(logging.WARNING, logger="sgwarp"):
         view, other = read_transforms(path)
     assert view.mask_path == other.mask_path == tmp_path / "masks" / "0.png"

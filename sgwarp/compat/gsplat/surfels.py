@@ -7,8 +7,8 @@ from typing import Any, NoReturn
 from sgwarp.errors import InputError
 
 INSTEAD = (
-    "2D Gaussians are not intersected with rays by sgwarp; load_gaussians reads 2DGS scenes as flat 3D Gaussians, which "
-    "rasterization renders (scales[:, 2] = 0)"
+    "2D Gaussians are not intersected with rays by sgwarp; load_gaussians reads 2DGS scenes as flat 3D Gaussians, "
+    "which rasterization renders (scales[:, 2] = 0)"
 )
 
 

@@ -20,9 +20,11 @@ SPZ_AXES = "RUB"
 GLTF_AXES = "LUF"
 # Powers of x, y, z modulo 2 of the spherical harmonics of degree 1 to 3, in the order of the coefficients.
 PARITIES = np.array(
-    [(0, 1, 0), (0, 0, 1), (1, 0, 0)]
-    + [(1, 1, 0), (0, 1, 1), (0, 0, 0), (1, 0, 1), (0, 0, 0)]
-    + [(0, 1, 0), (1, 1, 1), (0, 1, 0), (0, 0, 1), (1, 0, 0), (0, 0, 1), (1, 0, 0)]
+    [
+        *[(0, 1, 0), (0, 0, 1), (1, 0, 0)],
+        *[(1, 1, 0), (0, 1, 1), (0, 0, 0), (1, 0, 1), (0, 0, 0)],
+        *[(0, 1, 0), (1, 1, 1), (0, 1, 0), (0, 0, 1), (1, 0, 0), (0, 0, 1), (1, 0, 0)],
+    ]
 )
 
 
@@ -84,7 +86,9 @@ def move_gaussians(gaussians: Gaussians, matrix: Any) -> Gaussians:
     linear = matrix[:3, :3]
     scale = float(np.cbrt(np.linalg.det(linear))) if np.isfinite(matrix).all() else 0.0
     if scale <= 0 or np.abs(linear.T @ linear / scale**2 - np.eye(3)).max() > 1e-3:
-        raise InputError("the transform is not a rotation with one positive scale; scenes cannot be sheared or mirrored")
+        raise InputError(
+            "the transform is not a rotation with one positive scale; scenes cannot be sheared or mirrored"
+        )
     if np.array_equal(matrix, np.eye(4)):
         return gaussians
     rotation = linear / scale
@@ -168,4 +172,3 @@ def _multiply(a: Any, b: Any) -> Any:
         w * bz + x * by - y * bx + z * bw,
     )
     return np.stack(product, axis=1)
-

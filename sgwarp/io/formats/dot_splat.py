@@ -16,8 +16,8 @@ import os
 import numpy as np
 
 from sgwarp.errors import InputError
-from sgwarp.files.atomic import atomic_path
 from sgwarp.files.access import read_bytes
+from sgwarp.files.atomic import atomic_path
 from sgwarp.io.formats.axes import PLY_AXES, change_axes
 from sgwarp.io.ply import build_gaussians, host_arrays
 from sgwarp.scene import Gaussians
@@ -34,7 +34,9 @@ def read_splat(path: str | os.PathLike[str], axes: str = PLY_AXES) -> Gaussians:
     """
     data = read_bytes(path)
     if len(data) % ROW.itemsize or not data:
-        raise InputError(f"{path}: {len(data)} bytes are not a number of rows of 32 bytes; not a .splat file, or cut short")
+        raise InputError(
+            f"{path}: {len(data)} bytes are not a number of rows of 32 bytes; not a .splat file, or cut short"
+        )
     rows = np.frombuffer(data, ROW)
     scales = rows["scales"]
     if bool((scales < 0).any()):

@@ -21,7 +21,7 @@ from numpy.typing import NDArray
 
 from sgwarp.errors import InputError
 from sgwarp.files.atomic import atomic_path
-from sgwarp.io.formats.axes import PLY_AXES, GLTF_AXES, change_axes, move_gaussians
+from sgwarp.io.formats.axes import GLTF_AXES, PLY_AXES, change_axes, move_gaussians
 from sgwarp.io.formats.gltf_buffers import Document, read_document
 from sgwarp.io.formats.spz import gaussians_from_spz
 from sgwarp.io.ply import build_gaussians, host_arrays
@@ -53,7 +53,9 @@ def read_gltf(path: str | os.PathLike[str], axes: str = GLTF_AXES) -> Gaussians:
         if EXTENSION in _mapping(primitive.get("extensions"))
     ]
     if not parts:
-        raise InputError(f"{path}: holds no primitive with {EXTENSION}; it is a mesh or a point cloud, not a 3DGS scene")
+        raise InputError(
+            f"{path}: holds no primitive with {EXTENSION}; it is a mesh or a point cloud, not a 3DGS scene"
+        )
     return change_axes(join_gaussians(parts), axes, PLY_AXES)
 
 
@@ -164,7 +166,7 @@ def write_gltf(gaussians: Gaussians, path: str | os.PathLike[str], axes: str = G
         raise InputError(f"{path}: not written, the scene has no Gaussians")
     means, quats, scales, opacities, sh = host_arrays(change_axes(gaussians, PLY_AXES, axes))
     norms = np.linalg.norm(quats, axis=1, keepdims=True)
-    unit = np.where(norms > 0, quats / np.where(norms > 0, norms, 1), np.float32([1, 0, 0, 0]))
+    unit = np.where(norms > 0, quats / np.where(norms > 0, norms, 1), np.array([1, 0, 0, 0], np.float32))
     columns = {
         "POSITION": means,
         f"{EXTENSION}:ROTATION": unit[:, [1, 2, 3, 0]],
@@ -185,7 +187,9 @@ def write_gltf(gaussians: Gaussians, path: str | os.PathLike[str], axes: str = G
 
 def _description(columns: Mapping[str, NDArray[Any]], size: int) -> dict[str, Any]:
     """The JSON of a file whose buffer holds the columns one after the other."""
-    views, accessors, offset = [], [], 0
+    views: list[dict[str, Any]] = []
+    accessors: list[dict[str, Any]] = []
+    offset = 0
     for name, values in columns.items():
         count, width = values.shape
         kind = {1: "SCALAR", 3: "VEC3", 4: "VEC4"}[width]

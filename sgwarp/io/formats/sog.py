@@ -99,7 +99,8 @@ class _Meta:
             raise InputError(f"{path}: its meta.json is damaged, or not that of a SOG scene")
         if meta.get("version") != 2:
             raise InputError(
-                f"{path}: is SOG of version {meta.get('version', 1)}, version 2 is read; convert it with splat-transform"
+                f"{path}: is SOG of version {meta.get('version', 1)}, version 2 is read; convert it with "
+                "splat-transform"
             )
         self.meta = meta
 

@@ -29,8 +29,8 @@ import torch
 from numpy.typing import NDArray
 
 from sgwarp.errors import InputError
-from sgwarp.files.atomic import atomic_path
 from sgwarp.files.access import read_bytes
+from sgwarp.files.atomic import atomic_path
 from sgwarp.io.formats.axes import PLY_AXES, SPZ_AXES, change_axes
 from sgwarp.io.formats.zstd import compress_zstd, decompress_zstd
 from sgwarp.io.ply import build_gaussians, host_arrays

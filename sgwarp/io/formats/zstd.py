@@ -26,7 +26,9 @@ def decompress_zstd(path: str | os.PathLike[str], data: Any, size: int) -> bytes
     except (failure, EOFError) as error:
         raise InputError(f"{path}: a Zstandard stream is damaged ({error}); copy or download it again") from None
     if missing:
-        raise InputError(f"{path}: a Zstandard stream holds {size - missing} of {size} bytes; copy or download it again")
+        raise InputError(
+            f"{path}: a Zstandard stream holds {size - missing} of {size} bytes; copy or download it again"
+        )
     return b"".join(pieces)
 
 

@@ -56,7 +56,9 @@ def test_moved_scene(scene, covariances, rotations):
     assert np.abs(seen - turned).max() < 1e-5
 
 
-@pytest.mark.parametrize("linear", [np.diag([1.0, 1, -1]), np.diag([1.0, 2, 1]), np.zeros((3, 3)), np.full((3, 3), np.nan)])
+@pytest.mark.parametrize(
+    "linear", [np.diag([1.0, 1, -1]), np.diag([1.0, 2, 1]), np.zeros((3, 3)), np.full((3, 3), np.nan)]
+)
 def test_no_similarity(scene, linear):
     matrix = np.eye(4)
     matrix[:3, :3] = linear

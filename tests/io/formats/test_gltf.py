@@ -35,7 +35,9 @@ def document(tmp_path, attributes, form="uri", nodes=None, change=None, extensio
         "scenes": [{"nodes": [0]}],
         "accessors": accessors,
         "bufferViews": views,
-        "buffers": [{"byteLength": len(body), "uri": "data:application/octet-stream;base64," + base64.b64encode(body).decode()}],
+        "buffers": [
+            {"byteLength": len(body), "uri": "data:application/octet-stream;base64," + base64.b64encode(body).decode()}
+        ],
     }
     if form == "file":
         (tmp_path / "a b.bin").write_bytes(body)

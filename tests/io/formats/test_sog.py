@@ -43,7 +43,12 @@ def pictures(seed=0, bands=0, palettes=70):
         made["centroids"] = rng.integers(0, 256, (-(-palettes // 64), 64 * width, 4), dtype=np.uint8)
         made["centroids"][..., 3] = 255
         made["labels"][..., 0], made["labels"][..., 1] = rng.integers(0, palettes, (2, 4)), 0
-        meta["shN"] = {"count": palettes, "bands": bands, "codebook": CODEBOOK, "files": ["centroids.webp", "labels.webp"]}
+        meta["shN"] = {
+            "count": palettes,
+            "bands": bands,
+            "codebook": CODEBOOK,
+            "files": ["centroids.webp", "labels.webp"],
+        }
     else:
         del made["labels"]
     return made, meta
@@ -128,7 +133,7 @@ def test_damaged(tmp_path, name, change, message):
 def test_palette_out_of_range_and_names_outside(tmp_path):
     made, meta = pictures(bands=1)
     made["labels"][0, 0, 1] = 200
-    with pytest.raises(InputError, match="has palette .* of 70"):
+    with pytest.raises(InputError, match=r"has palette .* of 70"):
         read_sog(write(tmp_path / "a.sog", made, meta))
     made, meta = pictures()
     meta["quats"]["files"] = ["../quats.webp"]
