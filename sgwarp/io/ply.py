@@ -237,8 +237,10 @@ def build_gaussians(
     path: str | os.PathLike[str], *fields: NDArray[Any], extras: Mapping[str, NDArray[Any]] | None = None
 ) -> Gaussians:
     """Gaussians from arrays in the order of its fields; says how many rows are not finite."""
-    tensors = (torch.from_numpy(np.ascontiguousarray(field, np.float32)) for field in fields)
-    gaussians = Gaussians(*tensors, extras=extras)
+    means, quats, scales, opacities, sh = (
+        torch.from_numpy(np.ascontiguousarray(field, np.float32)) for field in fields
+    )
+    gaussians = Gaussians(means, quats, scales, opacities, sh, extras)
     if gaussians.non_finite:
         logging.getLogger("sgwarp").warning(
             "%s: %d of %d Gaussians hold NaN or infinity; they are kept, and never rendered",

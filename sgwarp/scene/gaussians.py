@@ -157,14 +157,15 @@ class Gaussians:
         return self._map(lambda t: t[index], {name: column[rows] for name, column in self.extras.items()})
 
     def _map(self, change: Callable[[Tensor], Tensor], extras: Mapping[str, NDArray[Any]] | None) -> Gaussians:
-        return Gaussians(*(change(getattr(self, name)) for name in FIELDS), extras=extras)
+        means, quats, scales, opacities, sh = (change(getattr(self, name)) for name in FIELDS)
+        return Gaussians(means, quats, scales, opacities, sh, extras)
 
 
 def join_gaussians(parts: Sequence[Gaussians]) -> Gaussians:
     """Several scenes as one, in this order; the highest degree of harmonics is kept, and the columns all have."""
     count = max(part.sh.shape[1] for part in parts)
     padded = [torch.nn.functional.pad(part.sh, (0, 0, 0, count - part.sh.shape[1])) for part in parts]
-    fields = [torch.cat([getattr(part, name) for part in parts]) for name in FIELDS[:-1]]
+    means, quats, scales, opacities = (torch.cat([getattr(part, name) for part in parts]) for name in FIELDS[:-1])
     names = set.intersection(*(set(part.extras or {}) for part in parts))
     extras = {name: np.concatenate([(part.extras or {})[name] for part in parts]) for name in sorted(names)}
-    return Gaussians(*fields, torch.cat(padded), extras=extras or None)
+    return Gaussians(means, quats, scales, opacities, torch.cat(padded), extras or None)
