@@ -1,4 +1,4 @@
-"""The one path from semantics to scores of texts: each of its stages changes the answer, in the order that is stated."""
+"""The one path from semantics to scores of texts: each of its stages changes the answer, in the stated order."""
 
 from dataclasses import replace
 
