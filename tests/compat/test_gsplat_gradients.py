@@ -115,11 +115,9 @@ def compare(compare_with, raw, mode, antialiased, packed, channels=None, by_cova
     compare_with(loss, point, {name: leaf.grad for name, leaf in t.items() if name not in unused})
 
 
-@pytest.mark.parametrize("packed", [False, True])
-@pytest.mark.parametrize("antialiased", [False, True])
-@pytest.mark.parametrize("mode", ["RGB", "RGB+D", "RGB+ED"])
-def test_batches_and_cameras(raw, assert_central_differences, mode, antialiased, packed):
-    compare(assert_central_differences, raw, mode, antialiased, packed)
+@pytest.mark.parametrize(("mode", "antialiased"), [("RGB", False), ("RGB", True), ("RGB+D", True), ("RGB+ED", False)])
+def test_batches_and_cameras(raw, assert_central_differences, mode, antialiased):
+    compare(assert_central_differences, raw, mode, antialiased, packed=False)
 
 
 @pytest.mark.parametrize("mode", ["D", "ED"])
