@@ -13,6 +13,8 @@ from torch import Tensor
 from sgwarp.compat import gsplat
 from sgwarp.ops.reference import rasterizer as reference
 
+pytestmark = pytest.mark.slow
+
 BATCH, CAMERAS = 2, 2
 BOUNDARY_BAND = 1e-4  # pixels nearer than this to a threshold, or to a change of the order, may flip in float32
 ORDER_BAND = 1e-6

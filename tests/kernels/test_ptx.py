@@ -19,6 +19,8 @@ from sgwarp.kernels.lifting import block as lifting_block
 from sgwarp.kernels.sparse import voxels
 from sgwarp.ops import launcher  # noqa: F401 - starts Warp quietly
 
+pytestmark = pytest.mark.slow
+
 ARCHITECTURES = (80, 86, 89, 90)
 WRITTEN = {80: 80, 86: 80, 89: 80, 90: 90}  # whose PTX an architecture is assembled from: 86 and 89 only add to 80
 

@@ -19,6 +19,7 @@ from sgwarp.scene import FeatureMap, View
 MODES = ("weighted", "center")
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("mode", MODES)
 def test_equals_the_mean_of_the_oracles_sums(stage, mode):
     views = [View(view.stem, view.camera.resized(36, 48)) for view in stage.views[:3]]

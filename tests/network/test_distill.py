@@ -27,6 +27,8 @@ from sgwarp.network.training.trainer import distill, state_path
 from sgwarp.runs.log import RunLog
 from sgwarp.scene import Gaussians, Semantics
 
+pytestmark = pytest.mark.slow
+
 SETTINGS = DistillSettings(arch="tiny", voxel=0.12, epochs=2, augment=Augmentation(up=1, elastic=()))
 
 

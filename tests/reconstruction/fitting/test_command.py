@@ -17,6 +17,8 @@ from sgwarp.errors import InputError
 from sgwarp.files.images import read_rgb
 from sgwarp.io.scenes import load_gaussians
 
+pytestmark = pytest.mark.slow
+
 
 def fails(capsys, *arguments) -> str:
     """Run a command that has to end with code 2; returns its one line on stderr."""

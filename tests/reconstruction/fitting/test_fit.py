@@ -25,6 +25,8 @@ from sgwarp.reconstruction.fitting.trainer import Fitted, fit
 from sgwarp.runs.log import RunLog
 from sgwarp.scene import Gaussians, View
 
+pytestmark = pytest.mark.slow
+
 # Short enough for a test, and with every event of a long run: refinements, and a rise of the degree.
 QUICK = FitSettings(steps=160, cap=1300, refine_every=20, degree_every=60, evaluate_every=80, sh_degree=2)
 
