@@ -163,6 +163,19 @@ def test_fit_starts(stopped, photographs, boards_points, tmp_path):
     assert isinstance(chosen.positional[1], tuple)
 
 
+def test_fit_writes_the_sheet_of_what_it_held_out(stopped, photographs, tmp_path):
+    """At the size, with the masks and before the background that the fit had."""
+    target = "sgwarp.reconstruction.fitting.report.write_contact_sheet"
+    options = ["--steps", 2, "--cap", 200, "--out", tmp_path / "s.ply", "--hold-out", 2, "--background", "white"]
+    call = stopped(target, "fit", photographs.views, *options, "--downscale", 2, "--masks", photographs.masks)
+    gaussians, shown, path = call.positional
+    assert len(gaussians) == 200
+    assert [photograph.stem for photograph in shown] == ["0000", "0002", "0004"]
+    assert all(photograph.camera.size == (36, 48) for photograph in shown)
+    assert all(photograph.mask is not None for photograph in shown)
+    assert (path, call.white) == (tmp_path / "s.held_out.jpg", True)
+
+
 @pytest.fixture
 def boards_points(tmp_path):
     from plyfile import PlyData, PlyElement
