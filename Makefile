@@ -1,7 +1,7 @@
 # `make test` and `make demo` need Python 3.10 or later, make and a C library; everything else goes into .venv.
 .DEFAULT_GOAL := help
 .NOTPARALLEL:
-.PHONY: help test demo lint docs bench clean
+.PHONY: help test test-fast demo lint docs bench clean
 
 VENV := .venv
 BIN := $(VENV)/bin
@@ -13,15 +13,19 @@ PYTHON ?= $(shell for name in python3 python python3.14 python3.13 python3.12 py
 	$$name -c 'import sys; sys.exit(sys.version_info < (3, 10))' >/dev/null 2>&1 && { echo $$name; break; }; done)
 
 help:
-	@echo "make test   install into $(VENV), run the tests       (ARGS='tests/io -x' for some of them)"
-	@echo "make demo   install into $(VENV), run the demonstration; pictures and a table go to demo_out/"
-	@echo "make lint   ruff and mypy"
-	@echo "make docs   build the documentation into site/; warnings are errors"
-	@echo "make bench  the benchmarks, as ratios within one run"
-	@echo "make clean  remove what the other targets built"
+	@echo "make test       install into $(VENV), run the tests       (ARGS='tests/io -x' for some of them)"
+	@echo "make test-fast  the same without the slow ones, for the inner loop"
+	@echo "make demo       install into $(VENV), run the demonstration; pictures and a table go to demo_out/"
+	@echo "make lint       ruff and mypy"
+	@echo "make docs       build the documentation into site/; warnings are errors"
+	@echo "make bench      the benchmarks, as ratios within one run"
+	@echo "make clean      remove what the other targets built"
 
 test: $(VENV)/installed-test
 	$(BIN)/python -m pytest $(ARGS)
+
+test-fast: $(VENV)/installed-test
+	$(BIN)/python -m pytest -m "not slow" $(ARGS)
 
 demo: $(VENV)/installed-demo
 	$(BIN)/sgwarp demo --out demo_out $(ARGS)

@@ -93,7 +93,7 @@ def _fitted(lens: Lens, image: Path) -> Lens:
         return lens
     factor = max(1, round(lens.width / width))
     # Tools round the smaller size up or down.
-    if max(abs(lens.width / factor - width), abs(lens.height / factor - height)) >= 1 or factor == 1:
+    if max(abs(lens.width / factor - width), abs(lens.height / factor - height)) >= 1:
         raise InputError(
             f"{image}: image is {width} x {height}, its camera says {lens.width} x {lens.height}, which is no integer "
             "factor; resize one of them"

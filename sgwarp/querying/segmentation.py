@@ -20,6 +20,7 @@ from sgwarp.querying.scores import Scoring, class_votes
 from sgwarp.scene import Camera, Gaussians, Semantics
 
 UNKNOWN = 255  # label of a pixel that no class can claim
+BOX = 9  # side of the box over which a query's scores are averaged before the best pixel is taken [pixels]
 KNOWN_OPACITY = 0.5  # least opacity that seen Gaussians must add up to at a pixel
 
 

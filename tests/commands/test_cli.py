@@ -52,8 +52,7 @@ def lifted(stage_files, tmp_path_factory):
 @pytest.fixture
 def text_semantics(stage, stage_files, toy_text, tmp_path, monkeypatch):
     """Semantics of a toy text space on disk, and its text encoder in the registry."""
-    registry = pytest.importorskip("sgwarp.encoders.registry")
-    monkeypatch.setattr(registry, "text_encoder_for", lambda space, *rest: toy_text)
+    monkeypatch.setattr("sgwarp.encoders.registry.text_encoder_for", lambda space, *rest: toy_text)
     path = tmp_path / "text.safetensors"
     save_semantics(lift(stage_files.gaussians, stage.views, stage.dense), path)
     return path

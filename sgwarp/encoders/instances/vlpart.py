@@ -21,8 +21,10 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from sgwarp.encoders.base import Instances, MissingMap
+from sgwarp.encoders.base import Instances, MapSource, MissingMap
+from sgwarp.encoders.building import Request, source_of_instances
 from sgwarp.encoders.maps.feature_files import load_archive
+from sgwarp.encoders.names import Member
 from sgwarp.errors import InputError
 from sgwarp.files.access import read_bytes
 from sgwarp.scene import View
@@ -167,3 +169,9 @@ def _decode_counts(text: str) -> list[int]:
                 value -= 1 << shift
         runs.append(value + (runs[-2] if len(runs) > 2 else 0))
     return runs
+
+
+def make_source(member: Member, request: Request) -> MapSource:
+    """Its masks, as the text side embeds their names."""
+    part = member.source
+    return source_of_instances(VLPartFiles(part.argument, **part.options), member, request)

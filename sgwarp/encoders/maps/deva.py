@@ -17,7 +17,10 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from sgwarp.encoders.base import MapSource
+from sgwarp.encoders.building import Request
 from sgwarp.encoders.maps.files import FileMaps
+from sgwarp.encoders.names import Member
 from sgwarp.errors import InputError
 from sgwarp.files.access import read_bytes
 from sgwarp.scene import FeatureMap, View
@@ -89,3 +92,8 @@ def read_predictions(path: Path) -> dict[str, dict[int, float]]:
 
 def _scores(segments: Sequence[Mapping[str, Any]]) -> dict[int, float]:
     return {int(segment["id"]): float(segment.get("score", 1.0)) for segment in segments}
+
+
+def make_source(member: Member, request: Request) -> MapSource:
+    """The ids of the views that are asked for."""
+    return DevaMaps(member.source.argument, request.views, **member.source.options)

@@ -22,7 +22,8 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from sgwarp.encoders.base import MissingMap
+from sgwarp.encoders.base import MapSource, MissingMap
+from sgwarp.encoders.building import Request
 from sgwarp.encoders.maps.feature_files import (
     FEATURE_SUFFIXES,
     Layout,
@@ -31,6 +32,7 @@ from sgwarp.encoders.maps.feature_files import (
     load_features,
     same_shape,
 )
+from sgwarp.encoders.names import Member
 from sgwarp.errors import InputError
 from sgwarp.files.access import read_bytes
 from sgwarp.files.images import read_ids
@@ -206,3 +208,8 @@ def open_files(folder: str, views: Sequence[View], layout: str | None = None, le
     except ValueError:
         raise InputError(f"files:{folder}: levels are numbers such as 1,2,3, not '{levels}'") from None
     return FileMaps(folder, views, layout=layout, levels=chosen)  # type: ignore[arg-type]
+
+
+def make_source(member: Member, request: Request) -> MapSource:
+    """`open_files` for the views that are asked for."""
+    return open_files(member.source.argument, request.views, **member.source.options)

@@ -15,8 +15,10 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from sgwarp.encoders.base import UNRANKED, Masks, MissingMap
+from sgwarp.encoders.base import UNRANKED, MaskGenerator, Masks, MissingMap
+from sgwarp.encoders.building import Request
 from sgwarp.encoders.maps.feature_files import load_archive
+from sgwarp.encoders.names import Part
 from sgwarp.errors import InputError
 from sgwarp.files.access import read_bytes
 from sgwarp.files.images import read_ids
@@ -89,3 +91,8 @@ def _from_stack(path: Path) -> Masks:
         return Masks(torch.from_numpy(arrays["masks"].astype(bool)), scores, ranks)
     except InputError as error:
         raise InputError(f"{path}: {error}") from None
+
+
+def make_masks(part: Part, request: Request) -> MaskGenerator:
+    """Masks from a folder."""
+    return FileMasks(part.argument)

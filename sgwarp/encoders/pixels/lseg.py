@@ -11,6 +11,9 @@ import torch
 from torch import Tensor
 from torch.nn.functional import normalize
 
+from sgwarp.encoders.base import MapSource
+from sgwarp.encoders.building import Request, some, source_of_pixels
+from sgwarp.encoders.names import Member, Part
 from sgwarp.encoders.pixels.lseg_network import LSegNetwork, LSegShape
 from sgwarp.encoders.prompts import PLAIN, Phrases
 from sgwarp.encoders.weights import Preparation, channels_first, fitted, identity_of_weights, load_tokenizer, require
@@ -247,3 +250,14 @@ def _as_transformers(weights: Mapping[str, Tensor], layers: int) -> dict[str, Te
             for letter, third in zip("qkv", thirds, strict=True):
                 named[f"{new}self_attn.{letter}_proj.{kind}"] = third
     return named
+
+
+def make_source(member: Member, request: Request) -> MapSource:
+    """Features of every pixel."""
+    return source_of_pixels(make_text(member.source, request), member.masks, request)
+
+
+def make_text(part: Part, request: Request) -> LSeg:
+    """Image and text side are one network."""
+    options = some(part, "longest", "tokenizer") | request.templates_of(part)
+    return LSeg(part.argument, device=request.device, **options)

@@ -103,7 +103,8 @@ def test_block_schedule_equals_lane_schedule(scene):
     lanes = composite(lists, camera, settings, None, True, "lanes")
     block = composite(lists, camera, settings, None, True, "block")
     clear = reference.rasterize(gaussians, camera).margin > BOUNDARY_BAND
-    for a, b in zip(lanes[:3], block[:3], strict=True):
+    assert len(lanes) == len(block) == 4  # colours, transmittance, depth sum, surface
+    for a, b in zip(lanes, block, strict=True):
         torch.testing.assert_close(a[clear], b[clear], rtol=1e-6, atol=1e-5)
     features = torch.rand(len(gaussians), 21)
     lanes = composite(lists, camera, settings, features, False, "lanes")

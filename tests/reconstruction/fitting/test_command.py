@@ -17,6 +17,8 @@ from sgwarp.errors import InputError
 from sgwarp.files.images import read_rgb
 from sgwarp.io.scenes import load_gaussians
 
+pytestmark = pytest.mark.slow
+
 
 def fails(capsys, *arguments) -> str:
     """Run a command that has to end with code 2; returns its one line on stderr."""
@@ -120,9 +122,13 @@ def start(boards, out: Path) -> subprocess.Popen:
     code = "import sys; from sgwarp.cli import main; sys.exit(main(sys.argv[1:]))"
     command = [sys.executable, "-c", code, "fit", str(boards.folder), *options]
     process = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, env={**os.environ})
+    until = time.monotonic() + 300
     while not out.with_name(f"{out.name}.checkpoint").exists():
         if process.poll() is not None:
             pytest.fail(process.stderr.read())
+        if time.monotonic() > until:
+            process.kill()
+            pytest.fail("no checkpoint after five minutes")
         time.sleep(0.01)
     return process
 
