@@ -9,6 +9,7 @@ import importlib.util
 import sys
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from contextlib import contextmanager
 from pathlib import Path
 from typing import NamedTuple
 
@@ -75,6 +76,23 @@ def _allow_input_error(path: Path) -> Iterator[None]:
 def allow_input_error():
     """Context manager for random input: either the block passes or an InputError names the file on one line."""
     return _allow_input_error
+
+
+@pytest.fixture
+def disk():
+    """`with disk(n):` a disk on which no file can grow beyond n bytes, as the operating system enforces it."""
+    resource = pytest.importorskip("resource")
+
+    @contextmanager
+    def limited(size: int) -> Iterator[None]:
+        soft, hard = resource.getrlimit(resource.RLIMIT_FSIZE)
+        resource.setrlimit(resource.RLIMIT_FSIZE, (size, hard))
+        try:
+            yield
+        finally:
+            resource.setrlimit(resource.RLIMIT_FSIZE, (soft, hard))
+
+    return limited
 
 
 @pytest.fixture(scope="session", autouse=True)
