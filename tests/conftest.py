@@ -9,7 +9,6 @@ import importlib.util
 import sys
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from contextlib import contextmanager
 from pathlib import Path
 from typing import NamedTuple
 

@@ -38,7 +38,7 @@ class Archive:
 
     def __init__(self, path: str | os.PathLike[str], size: int, file: zipfile.ZipFile) -> None:
         self.path, self.size, self._file = path, size, file
-        self.members = {info.filename: info for info in file.infolist() if not info.is_dir()}
+        self.members = {info.filename: info for info in file.infolist() if info.filename[-1:] not in ("", "/")}
         total = sum(info.file_size for info in file.infolist())
         if total > unpacked_limit(size):
             raise InputError(

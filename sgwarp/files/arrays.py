@@ -16,6 +16,7 @@ from sgwarp.files.access import open_input, reading
 from sgwarp.files.archives import open_archive
 
 NUMBERS = "biufc"  # kinds of dtype: bool, signed, unsigned, floating, complex
+LAST_CODE = 0x10FFFF  # of Unicode
 MOST_AXES = 32  # of any NumPy
 
 
@@ -34,8 +35,8 @@ def read_array(path: str | os.PathLike[str]) -> NDArray[Any]:
     return _shaped(path, values, shape, fortran)
 
 
-def read_arrays(path: str | os.PathLike[str]) -> dict[str, NDArray[Any]]:
-    """The arrays in an .npz file by name.
+def read_arrays(path: str | os.PathLike[str], texts: bool = False) -> dict[str, NDArray[Any]]:
+    """The arrays in an .npz file by name; with `texts`, arrays of strings too.
 
     Raises:
         InputError: The file is missing, damaged or cut short, holds something other than numbers, or unpacks to more
@@ -45,11 +46,11 @@ def read_arrays(path: str | os.PathLike[str]) -> dict[str, NDArray[Any]]:
     with open_archive(path) as archive:
         for name in archive.members:
             if name.endswith(".npy"):
-                arrays[name.removesuffix(".npy")] = parse_array(f"{path}: {name!r}", archive.read(name))
+                arrays[name.removesuffix(".npy")] = parse_array(f"{path}: {name!r}", archive.read(name), texts)
     return arrays
 
 
-def parse_array(where: str, data: bytes | bytearray) -> NDArray[Any]:
+def parse_array(where: str, data: bytes | bytearray, texts: bool = False) -> NDArray[Any]:
     """The array in the bytes of a .npy file; it shares their memory if they can be written to.
 
     Raises:
@@ -57,13 +58,15 @@ def parse_array(where: str, data: bytes | bytearray) -> NDArray[Any]:
     """
     # Only the header goes through a stream, which would copy the rest.
     stream = io.BytesIO(bytes(data[: npy.MAGIC_LEN + 4 + (1 << 16)]))
-    dtype, shape, fortran = _header(where, stream)
+    dtype, shape, fortran = _header(where, stream, texts)
     _check_size(where, dtype, shape, len(data) - stream.tell())
     values = np.frombuffer(data, dtype, math.prod(shape), stream.tell())
     return _shaped(where, values if isinstance(data, bytearray) else values.copy(), shape, fortran)
 
 
-def _header(where: str | os.PathLike[str], stream: BinaryIO) -> tuple[np.dtype[Any], tuple[int, ...], bool]:
+def _header(
+    where: str | os.PathLike[str], stream: BinaryIO, texts: bool = False
+) -> tuple[np.dtype[Any], tuple[int, ...], bool]:
     """Type, shape and whether columns come first; the stream is left at the first number."""
     try:
         version = npy.read_magic(stream)
@@ -76,7 +79,7 @@ def _header(where: str | os.PathLike[str], stream: BinaryIO) -> tuple[np.dtype[A
     # The header is a Python literal: tokenizer, parser and dtype() object in many ways, all to the same effect.
     except Exception as error:
         raise InputError(f"{where}: is not a NumPy array of numbers, or is damaged ({_line(error)})") from None
-    if dtype.kind not in NUMBERS or dtype.hasobject or dtype.names or dtype.shape:
+    if dtype.kind not in NUMBERS + "U" * texts or not dtype.itemsize or dtype.names or dtype.shape:
         raise InputError(f"{where}: holds {dtype}; expected numbers")
     if len(shape) > MOST_AXES or not all(type(n) is int and 0 <= n < 2**62 for n in shape):
         raise InputError(f"{where}: is damaged (shape {_line(shape)}); write it again")
@@ -96,6 +99,8 @@ def _shaped(where: str | os.PathLike[str], values: NDArray[Any], shape: tuple[in
         values = values.view(np.uint8) != 0  # a byte that is neither 0 nor 1 is no bool, to any library
     if not values.dtype.isnative:
         values = values.astype(values.dtype.newbyteorder("="))
+    if values.dtype.kind == "U" and bool((values.view(np.uint32) > LAST_CODE).any()):
+        raise InputError(f"{where}: holds texts that are none; write it again")
     try:
         return values.reshape(shape[::-1]).T if fortran else values.reshape(shape)
     except ValueError:

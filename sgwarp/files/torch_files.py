@@ -22,6 +22,7 @@ from torch import Tensor
 from sgwarp.errors import InputError
 from sgwarp.files.access import open_input
 from sgwarp.files.archives import Archive, open_archive
+from sgwarp.files.atomic import atomic_path
 from sgwarp.files.pickled import PLAIN_KEYS, Name, Table, UnpickleError, read_pickle
 
 ZIP_SIGNATURE = b"PK\x03\x04"
@@ -68,8 +69,23 @@ def load_torch(path: str | os.PathLike[str], mapped: bool = False) -> Any:
                 return _from_stream(_Pages(path, file.fileno(), size, mapped))
         except UnpickleError as error:
             raise InputError(f"{path}: is not a file of plain tensors, or is damaged ({error})") from None
-    what = "is empty" if not size else "was not written by torch.save"
+    what = "is empty" if not size else "is damaged, or was not written by torch.save"
     raise InputError(f"{path}: {what}; give a file of tensors")
+
+
+def save_torch(path: str | os.PathLike[str], content: Any) -> None:
+    """Write what `load_torch` reads, whole or not at all.
+
+    Raises:
+        InputError: It cannot be written.
+    """
+    with atomic_path(path) as temporary, open(temporary, "wb") as file:
+        try:
+            torch.save(content, file)
+        except RuntimeError as error:  # of the container's writer, after the disk said no
+            if error.__context__ is None or not isinstance(error.__context__, OSError):
+                raise
+            raise error.__context__ from None
 
 
 class _Pages:

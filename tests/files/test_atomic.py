@@ -60,7 +60,7 @@ def test_a_failed_write_is_one_error_and_leaves_nothing(tmp_path, disk):
     """The operating system itself refuses to let the file grow."""
     target = tmp_path / "out.txt"
     target.write_text("old")
-    with disk(8), pytest.raises(InputError, match=r"out\.txt: cannot be written \(File too large\)"):  # noqa: PT012
+    with disk(8), pytest.raises(InputError, match=r"out\.txt: cannot be written \(File too large\)"):
         with atomic_path(target) as temporary:
             temporary.write_text("more than eight")
     assert target.read_text() == "old"

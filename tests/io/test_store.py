@@ -156,7 +156,7 @@ def test_foreign_files(tmp_path):
     with pytest.raises(InputError, match=r"s\.safetensors: weight: expected shape \[3\], got \[4\]"):
         load_semantics(path)
     save_file(tensors, path, metadata={**good, "notes": "[1"})
-    with pytest.raises(InputError, match="its notes are damaged"):
+    with pytest.raises(InputError, match="its notes: is not valid JSON"):
         read_notes(path)
 
 

@@ -16,9 +16,9 @@ import torch
 from torch import Tensor
 
 from sgwarp.encoders.base import UNRANKED, Masks, MissingMap
-from sgwarp.encoders.maps.feature_files import load_archive
 from sgwarp.errors import InputError
 from sgwarp.files.access import read_bytes
+from sgwarp.files.arrays import read_arrays
 from sgwarp.files.images import read_ids
 from sgwarp.scene import View
 
@@ -79,7 +79,7 @@ def _from_ids(path: Path) -> Masks:
 
 
 def _from_stack(path: Path) -> Masks:
-    arrays = load_archive(path)
+    arrays = read_arrays(path)
     if "masks" not in arrays or arrays["masks"].ndim != 3:
         raise InputError(f"{path}: expected an array masks [M, h, w]")
     count = len(arrays["masks"])
