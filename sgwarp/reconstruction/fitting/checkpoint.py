@@ -73,8 +73,10 @@ class Checkpoint:
         """
         try:
             content = load_torch(path)
-        except InputError as error:
-            raise InputError(f"{error}; or start again without --resume") from None
+        except InputError:
+            if not path.is_file():
+                raise
+            raise InputError(f"{path}: is not a checkpoint, or is damaged; start again without --resume") from None
         names = {field.name for field in dataclasses.fields(cls)}
         if not isinstance(content, dict) or content.pop("format", None) != FORMAT or set(content) != names:
             raise InputError(f"{path}: was written by another version; start again without --resume")

@@ -235,7 +235,8 @@ class _Run:
             with self._timed():
                 refine()
             if checkpoint is not None and self.step % checkpoint_every == 0 and self.step < settings.steps:
-                self.try_to_save(checkpoint)
+                with self.log.stage("checkpoint"):
+                    self.try_to_save(checkpoint)
         report(self.step, settings.steps, self._text((self.step - first) / max(time.perf_counter() - began, 1e-9)))
         return True
 
@@ -322,12 +323,11 @@ class _Run:
 
     def try_to_save(self, path: Path) -> None:
         """Write a checkpoint; where that fails, say so and go on: the next one may be written again."""
-        with self.log.stage("checkpoint"):
-            try:
-                self.save(path)
-            except InputError as error:
-                logger.warning("%s; the fit goes on without it", error)
-                self.log.leave_out("checkpoints")
+        try:
+            self.save(path)
+        except InputError as error:
+            logger.warning("%s; the fit goes on without it", error)
+            self.log.leave_out("checkpoints")
 
     def save(self, path: Path) -> None:
         """Write a checkpoint."""
