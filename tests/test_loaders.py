@@ -18,7 +18,15 @@ from sgwarp.errors import InputError
 ROOT = Path(sgwarp.__file__).resolve().parent
 BANNED = {
     *("torch.load", "torch.jit.load", "torch.hub.load", "np.load", "numpy.load", "np.fromfile", "np.loadtxt"),
-    *("pickle.load", "pickle.loads", "pickle.Unpickler", "joblib.load", "yaml.load", "yaml.unsafe_load", "marshal.loads"),
+    *(
+        "pickle.load",
+        "pickle.loads",
+        "pickle.Unpickler",
+        "joblib.load",
+        "yaml.load",
+        "yaml.unsafe_load",
+        "marshal.loads",
+    ),
     *("eval", "exec", "shelve.open", "np.lib.format.read_array", "json.load", "json.loads", "zipfile.ZipFile"),
     *("safe_open", "load_file", "cv2.imread", "gzip.open", "gzip.decompress", "tarfile.open"),
 }

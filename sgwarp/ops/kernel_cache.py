@@ -25,23 +25,32 @@ LITTLE = 32 * 2**20  # bytes; a module takes a few megabytes
 Result = TypeVar("Result")
 
 
+_reason = ""  # why kernels cannot be kept
+
+
 def start() -> None:
-    """`wp.init()`; where its cache cannot be made, with one for this process alone."""
+    """`wp.init()`; where its cache cannot be made, with one for this process alone, which `tell` then says."""
+    global _reason
     try:
         wp.init()
         return
     except OSError as error:
-        reason = error.strerror or str(error)
+        _reason = error.strerror or str(error)
     folder = tempfile.mkdtemp(prefix="sgwarp-kernels-")
     atexit.register(shutil.rmtree, folder, ignore_errors=True)
     wp.config.kernel_cache_dir = folder
     wp.init()
-    logging.getLogger("sgwarp").warning(
-        "Warp cannot keep compiled kernels (%s), and compiles them anew in each run; set %s to a folder that can be "
-        "written to",
-        reason,
-        VARIABLE,
-    )
+
+
+def tell() -> None:
+    """Say that kernels cannot be kept, if they cannot."""
+    if _reason:
+        logging.getLogger("sgwarp").warning(
+            "Warp cannot keep compiled kernels (%s), and compiles them anew in each run; set %s to a folder that can "
+            "be written to",
+            _reason,
+            VARIABLE,
+        )
 
 
 def mended(kernel: wp.Kernel, run: Callable[[], Result]) -> Result:

@@ -52,6 +52,7 @@ def _init_warp() -> None:
 
 
 _init_warp()
+kernel_cache.tell()
 
 
 def _available_cores() -> int:
