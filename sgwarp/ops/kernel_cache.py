@@ -95,5 +95,5 @@ def _is_full() -> bool:
 
 def _unwritable(reason: str) -> InputError:
     return InputError(
-        f"Warp's cache of compiled kernels {_folder()}: cannot be written ({reason}); set {VARIABLE} to a folder that can"
+        f"Warp's cache of compiled kernels {_folder()}: cannot be written ({reason}); set {VARIABLE} to one that can"
     )

@@ -129,7 +129,7 @@ def test_a_home_that_cannot_be_written_names_the_variable(tmp_path):
     (tmp_path / "file").touch()
     done = subprocess.run(
         [sys.executable, "-c", code],
-        env={**os.environ, "PYTHONPATH": ROOT, "TMPDIR": str(tmp_path), "WARP_CACHE_PATH": str(tmp_path / "file" / "x")},
+        env={**os.environ, "PYTHONPATH": ROOT, "TMPDIR": str(tmp_path), "WARP_CACHE_PATH": f"{tmp_path}/file/x"},
         capture_output=True, text=True, check=False,
     )  # fmt: skip
     assert done.returncode == 0, done.stderr
