@@ -1,8 +1,9 @@
-"""Mutated files against every reader: nothing but InputError, within 2 seconds of the processor, within the memory rule.
+"""Mutated files against every reader: nothing but InputError, within 2 seconds and the memory rule.
 
     python tests/fuzz/fuzzer.py --inputs 1000000 --keep findings/
 
-prints a table and exits with 1 if anything was found; what was found lies in `findings/`, to become a part of the corpus.
+prints a table and exits with 1 if anything was found; what was found lies in `findings/`, to become a part of the
+corpus. Seconds are those of the processor, for others may use the machine, too.
 The memory rule: four times the file plus 64 MB, measured as the peak of the resident set over what it was before; and
 no single reservation beyond SPACE, which the address space is limited to.
 """
