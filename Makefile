@@ -1,7 +1,7 @@
 # `make test` and `make demo` need Python 3.10 or later, make and a C library; everything else goes into .venv.
 .DEFAULT_GOAL := help
 .NOTPARALLEL:
-.PHONY: help test test-fast demo lint docs bench clean
+.PHONY: help test test-fast demo lint docs bench fuzz lock bill clean
 
 VENV := .venv
 BIN := $(VENV)/bin
@@ -19,6 +19,9 @@ help:
 	@echo "make lint       ruff and mypy"
 	@echo "make docs       build the documentation into site/; warnings are errors"
 	@echo "make bench      the benchmarks, as ratios within one run"
+	@echo "make fuzz       a million damaged files against every reader (ARGS='--inputs 10000' for fewer)"
+	@echo "make lock       requirements.lock anew: every package of constraints.txt with its hashes"
+	@echo "make bill       licenses of everything installed      (ARGS='--out FILE' for a bill of materials)"
 	@echo "make clean      remove what the other targets built"
 
 test: $(VENV)/installed-test
@@ -41,6 +44,16 @@ docs: $(VENV)/installed-docs
 
 bench: $(VENV)/installed-test
 	$(BIN)/python -m benchmarks $(ARGS)
+
+fuzz: $(VENV)/installed-test
+	$(BIN)/python tests/fuzz/fuzzer.py --keep fuzz_findings $(ARGS)
+
+lock: $(BIN)/python
+	$(BIN)/python -m pip install --disable-pip-version-check --quiet uv==0.13.9
+	$(BIN)/python -m tools.lock
+
+bill: $(VENV)/installed-test
+	$(BIN)/python -m tools.bill $(ARGS)
 
 clean:
 	rm -rf $(VENV) demo_out site build dist .pytest_cache .mypy_cache .ruff_cache .hypothesis

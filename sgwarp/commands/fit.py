@@ -148,8 +148,10 @@ class Fit(Options):
 
         init = self.init
         if init == "auto":
-            own = self.points or find_points(self.views)
-            init = "depth" if self.depth is not None else "points" if own is not None else "random"
+            if self.depth is not None:
+                init = "depth"
+            else:
+                init = "points" if self.points or find_points(self.views) else "random"
         if init == "depth" and self.depth is None:
             raise InputError("--init depth: needs --depth, the folder of the depth images")
         if self.resume or init == "random":  # a checkpoint holds the whole scene

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
@@ -10,7 +9,7 @@ from pathlib import Path
 import torch
 from torch import Tensor
 
-from sgwarp.files.access import read_bytes
+from sgwarp.files.documents import read_json
 from sgwarp.files.images import read_ids
 from sgwarp.io.scenes import load_gaussians
 from sgwarp.io.views import load_views
@@ -48,7 +47,7 @@ class Room:
         Raises:
             InputError: A file is missing or damaged.
         """
-        names = json.loads(read_bytes(folder / CLASSES_FILE))
+        names = read_json(folder / CLASSES_FILE)
         return cls(
             folder,
             load_gaussians(folder / SCENE_FILE),

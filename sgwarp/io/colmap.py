@@ -14,6 +14,7 @@ from sgwarp.errors import InputError
 from sgwarp.files.images import read_size
 from sgwarp.io.colmap_model import ImageRecord, find_model, read_cameras, read_images
 from sgwarp.io.colmap_model import read_points as read_points
+from sgwarp.io.names import inside
 from sgwarp.io.stems import unique_stems
 from sgwarp.io.undistort import Lens, pinhole_view
 from sgwarp.scene import View
@@ -49,7 +50,7 @@ def read_colmap(path: str | os.PathLike[str], image_folder: str = "images", phot
     for record in records:
         if record.camera_id not in lenses:
             raise InputError(f"{model}: image {record.name!r} refers to camera {record.camera_id}, which is not listed")
-        image = folder / record.name if folder is not None else None
+        image = inside(model, folder, record.name) if folder is not None else None
         pose = _world_to_camera(record)
         if image is not None and not os.path.isfile(image):
             missing.append(record.name)
@@ -59,7 +60,7 @@ def read_colmap(path: str | os.PathLike[str], image_folder: str = "images", phot
             kept.append((record, pose, image))
     log = logging.getLogger("sgwarp")
     if missing:
-        log.warning("%s: left out %d images without photograph, first %s", model, len(missing), missing[0])
+        log.warning("%s: left out %d images without photograph, first %r", model, len(missing), missing[0])
     if unposed:
         log.warning("%s: left out %d images whose pose holds NaN or infinity", model, unposed)
     if not kept:

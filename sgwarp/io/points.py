@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-import json
+import logging
 import os
 from pathlib import Path
 from typing import Any
@@ -11,8 +11,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sgwarp.errors import InputError
-from sgwarp.files.access import read_bytes
+from sgwarp.files.documents import read_json
 from sgwarp.io.colmap_model import find_model, read_points
+from sgwarp.io.names import inside
 from sgwarp.io.ply import POSITION, columns, read_elements
 
 PLY_NAMES = ("points3D.ply", "sparse_pc.ply", "point_cloud.ply")  # beside a transforms.json that names none
@@ -78,17 +79,18 @@ def find_points(path: str | os.PathLike[str]) -> Path | None:
 
 def _named_in(transforms: Path) -> Path | None:
     try:
-        meta: Any = json.loads(read_bytes(transforms))
-    except (ValueError, RecursionError):
+        meta: Any = read_json(transforms)
+    except InputError:
         return None  # whoever reads the cameras says what is wrong with the file
     name = meta.get(PLY_KEY) if isinstance(meta, dict) else None
     if name is None:
         return None
     if not isinstance(name, str):
         raise InputError(f"{transforms}: '{PLY_KEY}' must be the name of a file, got {name!r}")
-    named = transforms.parent / name.replace("\\", "/")
+    named = inside(transforms, transforms.parent, name)
     if not named.is_file():
-        raise InputError(f"{transforms}: its '{PLY_KEY}' {name!r} does not exist; copy the file, or remove the entry")
+        logging.getLogger("sgwarp").warning("%s: its '%s' %r does not exist", transforms, PLY_KEY, name)
+        return None
     return named
 
 

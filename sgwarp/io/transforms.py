@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import logging
 import math
 import os
@@ -14,8 +13,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sgwarp.errors import InputError
-from sgwarp.files.access import read_bytes
+from sgwarp.files.documents import read_json
 from sgwarp.files.images import read_size
+from sgwarp.io.names import inside
 from sgwarp.io.stems import IMAGE_SUFFIXES, unique_stems
 from sgwarp.io.undistort import Lens, pinhole_view
 from sgwarp.scene import View
@@ -58,7 +58,7 @@ def read_transforms(path: str | os.PathLike[str], photographs: bool = True) -> l
         name = frame.get("file_path") if isinstance(frame, dict) else None
         if not isinstance(name, str) or not name:
             raise InputError(f"{where}: has no 'file_path'; name the photograph it belongs to")
-        image = _find_image(path.parent, name) if photographs else None
+        image = _find_image(path, name) if photographs else None
         if photographs and image is None:
             missing.append(name)
             continue
@@ -69,7 +69,7 @@ def read_transforms(path: str | os.PathLike[str], photographs: bool = True) -> l
         kept.append((index, frame, pose, image))
     log = logging.getLogger("sgwarp")
     if missing:
-        log.warning("%s: left out %d frames without photograph, first %s", path, len(missing), missing[0])
+        log.warning("%s: left out %d frames without photograph, first %r", path, len(missing), missing[0])
     if unposed:
         log.warning("%s: left out %d frames whose pose holds NaN or infinity", path, unposed)
     if not kept:
@@ -89,10 +89,7 @@ def read_transforms(path: str | os.PathLike[str], photographs: bool = True) -> l
 
 
 def _parse(path: Path) -> dict[str, Any]:
-    try:
-        meta = json.loads(read_bytes(path))
-    except (ValueError, RecursionError) as error:
-        raise InputError(f"{path}: is not valid JSON ({error}); copy or export it again") from None
+    meta = read_json(path)
     if not isinstance(meta, dict) or not isinstance(meta.get("frames"), list):
         raise InputError(f"{path}: has no list 'frames'; expected a transforms.json of nerfstudio or instant-ngp")
     if not meta["frames"]:
@@ -100,8 +97,8 @@ def _parse(path: Path) -> dict[str, Any]:
     return meta
 
 
-def _find_image(folder: Path, name: str) -> Path | None:
-    listed = folder / name.replace("\\", "/")
+def _find_image(transforms: Path, name: str) -> Path | None:
+    listed = inside(transforms, transforms.parent, name)
     candidates = (listed, *(listed.with_name(listed.name + suffix) for suffix in IMAGE_SUFFIXES))
     return next((path for path in candidates if os.path.isfile(path)), None)
 

@@ -23,6 +23,8 @@ import warp as wp
 from torch import Tensor
 
 from sgwarp.errors import InputError
+from sgwarp.ops import kernel_cache
+from sgwarp.ops.kernel_cache import mended
 
 CHUNKS_PER_THREAD = 8  # enough to even out tiles of different cost
 MAX_THREADS = 512
@@ -34,7 +36,7 @@ def _init_warp() -> None:
     if wp.config.log_level == wp.LOG_INFO:
         wp.config.log_level = wp.LOG_WARNING
     if torch.cuda.is_available():
-        wp.init()
+        kernel_cache.start()
         return
     # The native library writes that warning straight to file descriptor 2, past every setting.
     sys.stderr.flush()
@@ -42,7 +44,7 @@ def _init_warp() -> None:
     sink = os.open(os.devnull, os.O_WRONLY)
     try:
         os.dup2(sink, 2)
-        wp.init()
+        kernel_cache.start()
     finally:
         os.dup2(kept, 2)
         os.close(kept)
@@ -50,6 +52,7 @@ def _init_warp() -> None:
 
 
 _init_warp()
+kernel_cache.tell()
 
 
 def _available_cores() -> int:
@@ -61,6 +64,21 @@ _thread_count = _available_cores()
 _pool: ThreadPoolExecutor | None = None
 _pool_lock = threading.Lock()
 _local = threading.local()
+
+
+def _after_fork() -> None:
+    """In a forked process: threads and locks of the parent do not exist here, its memory is a copy.
+
+    torch's own threads are gone as well, and its OpenMP would wait for them: it works with one, as in a DataLoader.
+    """
+    global _pool, _pool_lock, _local
+    _pool, _pool_lock, _local = None, threading.Lock(), threading.local()
+    _idle.clear()
+    torch.set_num_threads(1)
+
+
+if hasattr(os, "register_at_fork"):
+    os.register_at_fork(after_in_child=_after_fork)
 
 
 def get_threads() -> int:
@@ -115,11 +133,11 @@ def launch(
     head = [0, 0] if slots else [0]
     if device.type == "cuda":
         stream = wp.stream_from_torch(torch.cuda.current_stream(device))
-        wp.launch(kernel, count, [*head, *inputs], outputs, stream=stream)
+        mended(kernel, lambda: wp.launch(kernel, count, [*head, *inputs], outputs, stream=stream))
         return
     threads = 1 if chunk is None and count < SMALL else min(_thread_count, count)
     if threads == 1:
-        wp.launch(kernel, count, [*head, *inputs], outputs, device="cpu")
+        mended(kernel, lambda: wp.launch(kernel, count, [*head, *inputs], outputs, device="cpu"))
         return
     size = chunk or max(1, -(-count // (threads * CHUNKS_PER_THREAD)))
     ticket = itertools.count()  # next() is atomic under the interpreter lock
@@ -134,7 +152,7 @@ def launch(
             command.set_dim(min(size, count - base))
             command.launch()
 
-    kernel.module.load("cpu", block_dim=1)  # once, before several threads ask for it
+    mended(kernel, lambda: kernel.module.load("cpu", block_dim=1))  # once, before several threads ask for it
     helpers = [_executor().submit(work, slot) for slot in range(1, threads)]
     try:
         work(0)
@@ -149,12 +167,14 @@ def launch_blocks(
     """Run a block-schedule kernel with 256 threads per block; on the CPU the threads are cooperative fibers."""
     if device.type == "cuda":
         stream = wp.stream_from_torch(torch.cuda.current_stream(device))
-        wp.launch_tiled(kernel, dim=list(grid), inputs=inputs, outputs=outputs, block_dim=256, stream=stream)
+        tiles = {"dim": list(grid), "inputs": inputs, "outputs": outputs, "block_dim": 256}
+        mended(kernel, lambda: wp.launch_tiled(kernel, **tiles, stream=stream))
         return
     previous = wp.config.enable_cpu_blocks
     wp.config.enable_cpu_blocks = True
     try:
-        wp.launch_tiled(kernel, dim=list(grid), inputs=inputs, outputs=outputs, block_dim=256, device="cpu")
+        tiles = {"dim": list(grid), "inputs": inputs, "outputs": outputs, "block_dim": 256}
+        mended(kernel, lambda: wp.launch_tiled(kernel, **tiles, device="cpu"))
     finally:
         wp.config.enable_cpu_blocks = previous
 
@@ -167,9 +187,9 @@ def launch_plain(
         return
     if device.type == "cuda":
         stream = wp.stream_from_torch(torch.cuda.current_stream(device))
-        wp.launch(kernel, count, inputs, outputs, stream=stream)
+        mended(kernel, lambda: wp.launch(kernel, count, inputs, outputs, stream=stream))
     else:
-        wp.launch(kernel, count, inputs, outputs, device="cpu")
+        mended(kernel, lambda: wp.launch(kernel, count, inputs, outputs, device="cpu"))
 
 
 def view(tensor: Tensor, dtype: Any) -> Any:

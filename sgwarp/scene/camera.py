@@ -9,6 +9,8 @@ from torch import Tensor
 
 from sgwarp.scene.checks import require
 
+MOST_PIXELS = 2**31 - 1  # kernels count them with 32 bits
+
 
 @dataclass(frozen=True, eq=False)
 class Camera:
@@ -51,9 +53,13 @@ class Camera:
         require(bool(torch.linalg.det(R) > 0), "world_to_camera: mirrors the world (determinant -1)")
         affine = torch.tensor([0.0, 0.0, 0.0, 1.0], dtype=torch.float64)
         require(bool((pose[3] == affine).all()), "world_to_camera: last row must be [0, 0, 0, 1]")
+        sizes = (self.width, self.height)
+        require(not any(isinstance(n, bool) for n in sizes), f"image size: expected whole pixels, got {sizes}")
         whole = self.width == int(self.width) and self.height == int(self.height)
         require(whole, f"image size: expected whole pixels, got {self.width} x {self.height}")
         require(self.width > 0 and self.height > 0, f"image size must be positive, got {self.width} x {self.height}")
+        few = self.width * self.height <= MOST_PIXELS
+        require(few, f"image size: {self.width} x {self.height} is more than {MOST_PIXELS} pixels")
         require(0 < self.near < self.far, f"near: expected 0 < near < far, got {self.near} and {self.far}")
         put(self, "K", K)
         put(self, "world_to_camera", pose)

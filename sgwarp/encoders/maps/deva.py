@@ -8,7 +8,6 @@ An id means the same thing in all views, so the maps are one-hot in the space "l
 
 from __future__ import annotations
 
-import json
 import os
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -22,7 +21,7 @@ from sgwarp.encoders.building import Request
 from sgwarp.encoders.maps.files import FileMaps
 from sgwarp.encoders.names import Member
 from sgwarp.errors import InputError
-from sgwarp.files.access import read_bytes
+from sgwarp.files.documents import read_json
 from sgwarp.scene import FeatureMap, View
 
 
@@ -82,11 +81,11 @@ def read_predictions(path: Path) -> dict[str, dict[int, float]]:
         InputError: The file is missing or damaged.
     """
     try:
-        content = json.loads(read_bytes(path))
+        content = read_json(path)
         return {Path(frame["file_name"]).stem: _scores(frame["segments_info"]) for frame in content["annotations"]}
     except InputError:
         raise
-    except (ValueError, TypeError, KeyError) as error:
+    except (ValueError, TypeError, KeyError, OverflowError, AttributeError) as error:
         raise InputError(f"{path}: is not the pred.json of DEVA, or is damaged ({error!r})") from None
 
 

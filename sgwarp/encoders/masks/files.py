@@ -17,10 +17,10 @@ from torch import Tensor
 
 from sgwarp.encoders.base import UNRANKED, MaskGenerator, Masks, MissingMap
 from sgwarp.encoders.building import Request
-from sgwarp.encoders.maps.feature_files import load_archive
 from sgwarp.encoders.names import Part
 from sgwarp.errors import InputError
 from sgwarp.files.access import read_bytes
+from sgwarp.files.arrays import read_arrays
 from sgwarp.files.images import read_ids
 from sgwarp.scene import View
 
@@ -81,7 +81,7 @@ def _from_ids(path: Path) -> Masks:
 
 
 def _from_stack(path: Path) -> Masks:
-    arrays = load_archive(path)
+    arrays = read_arrays(path)
     if "masks" not in arrays or arrays["masks"].ndim != 3:
         raise InputError(f"{path}: expected an array masks [M, h, w]")
     count = len(arrays["masks"])

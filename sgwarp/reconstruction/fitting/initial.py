@@ -12,6 +12,7 @@ import torch
 from torch import Tensor
 
 from sgwarp.errors import InputError
+from sgwarp.files.arrays import read_array
 from sgwarp.files.images import read_ids
 from sgwarp.ops.neighbors import mean_squared_neighbor_distance
 from sgwarp.reconstruction.depth import SH_C0
@@ -138,9 +139,6 @@ def depth_from_folder(folder: Path) -> Callable[[View], Any]:
         numbers = folder / f"{view.stem}.npy"
         if not numbers.is_file():
             return read_ids(folder / f"{view.stem}.png").astype(np.float32) * np.float32(MILLIMETRE)
-        try:
-            return np.load(numbers, allow_pickle=False)
-        except (ValueError, EOFError):
-            raise InputError(f"{numbers}: is not an array that NumPy can read; write it again") from None
+        return read_array(numbers)
 
     return depth

@@ -140,7 +140,7 @@ def fit(
     with deferred_interrupt() as interrupted:
         complete = run.go(report, path, checkpoint_every, interrupted)
     if path is not None:
-        run.save(path)
+        run.try_to_save(path)
     measured = run.measure()
     if path is not None and complete and not keep_checkpoint:
         path.unlink(missing_ok=True)
@@ -236,7 +236,7 @@ class _Run:
                 refine()
             if checkpoint is not None and self.step % checkpoint_every == 0 and self.step < settings.steps:
                 with self.log.stage("checkpoint"):
-                    self.save(checkpoint)
+                    self.try_to_save(checkpoint)
         report(self.step, settings.steps, self._text((self.step - first) / max(time.perf_counter() - began, 1e-9)))
         return True
 
@@ -321,6 +321,14 @@ class _Run:
         speed = f", {rate:.1f} it/s" if self.step else ""
         return f"loss {self.loss:.4f}, {self.psnr:.2f} dB{held_out}, {len(self.model):,} Gaussians{speed}"
 
+    def try_to_save(self, path: Path) -> None:
+        """Write a checkpoint; where that fails, say so and go on: the next one may be written again."""
+        try:
+            self.save(path)
+        except InputError as error:
+            logger.warning("%s; the fit goes on without it", error)
+            self.log.leave_out("checkpoints")
+
     def save(self, path: Path) -> None:
         """Write a checkpoint."""
         Checkpoint(
@@ -338,10 +346,13 @@ class _Run:
         """Go on from a checkpoint."""
         own = fingerprint(self.photographs, self.held_out)
         saved = Checkpoint.load(path, self.settings, own, self.device)
-        self._adopt(Model.restored(saved.model))
-        self.strategy.restore(saved.strategy)
-        if self.exposure is not None:
-            self.exposure.restore(saved.exposure)
-        self.step, self.seconds = saved.step, saved.seconds
-        (self.loss, self.psnr), *points = saved.curve
-        self.curve = [Measurement(*point) for point in points]  # type: ignore[arg-type]
+        try:
+            self._adopt(Model.restored(saved.model))
+            self.strategy.restore(saved.strategy)
+            if self.exposure is not None:
+                self.exposure.restore(saved.exposure)
+            self.step, self.seconds = saved.step, saved.seconds
+            (self.loss, self.psnr), *points = saved.curve
+            self.curve = [Measurement(*point) for point in points]  # type: ignore[arg-type]
+        except (KeyError, TypeError, ValueError):
+            raise InputError(f"{path}: is damaged; start again without --resume") from None
