@@ -155,9 +155,17 @@ def project(gaussians: Gaussians, camera: Camera, settings: RasterSettings) -> P
     else:
         launch(projection_lanes.project_groups, -(-n // projection_lanes.GROUP), inputs, outputs, device=device)
     # The kernel reads geometry and opacity only. On CUDA it is cheaper to look at all than to wait for the answer.
-    if device.type == "cuda" or gaussians.colors_may_be_non_finite:
+    if device.type == "cuda":
+        mark_non_finite_colors(gaussians.sh, status)
+    elif gaussians.colors_may_be_non_finite:
         status.masked_fill_(~gaussians.finite, int(projection.NON_FINITE))
     return Projected(splats, status, depths)
+
+
+def mark_non_finite_colors(sh: Tensor, status: Tensor) -> None:
+    """Set the status [N] of Gaussians with a coefficient that is not finite, [N, K, 3]; one launch."""
+    inputs, outputs = [view(sh, wp.vec3)], [view(status, wp.uint8)]
+    launch_plain(projection.mark_non_finite_colors, sh.shape[0] * sh.shape[1], inputs, outputs, device=sh.device)
 
 
 def depth_order(projected: Projected) -> Tensor:

@@ -265,3 +265,14 @@ def test_inputs_are_checked(make_scene):
 def test_kernels_read_torch_memory_without_a_copy(make_scene):
     _, gaussians, _ = make_scene("random_cloud")
     assert launcher.view(gaussians.means, wp.vec3).ptr == gaussians.means.data_ptr()
+
+
+def test_colours_that_are_not_finite_are_marked_as_on_cuda(make_scene):
+    _, gaussians, camera = make_scene("sh3")
+    sh = gaussians.sh.clone()
+    sh[3, 0, 1], sh[5, -1, 2], sh[8, 2, 0], sh[9] = torch.nan, torch.inf, -torch.inf, 3e38
+    status = torch.arange(len(gaussians)).to(torch.uint8) % 5
+    expected = torch.where(torch.isfinite(sh).flatten(1).all(dim=1), status, 1)
+    tiles.mark_non_finite_colors(sh, status)
+    assert torch.equal(status, expected.to(torch.uint8))
+    assert int((expected == 1).sum()) > 3
