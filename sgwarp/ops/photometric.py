@@ -11,7 +11,7 @@ from torch import Tensor
 from sgwarp.errors import InputError
 from sgwarp.kernels.fitting import photometric as kernels
 from sgwarp.kernels.transmittance import LANES, Lanes
-from sgwarp.ops.launcher import launch, scratch, view
+from sgwarp.ops.launcher import launch, scratch, view, warp_device
 
 FLOAT_BYTES = 4
 
@@ -101,7 +101,7 @@ class _Planes:
             shape=(count, height, stride - LANES + 1),
             strides=(height * stride * FLOAT_BYTES, stride * FLOAT_BYTES, FLOAT_BYTES),
             capacity=memory.numel() * FLOAT_BYTES,
-            device=wp.device_from_torch(device),
+            device=warp_device(device),
         )
 
 

@@ -39,6 +39,7 @@ from sgwarp.reconstruction.fitting.photographs import (
 )
 from sgwarp.reconstruction.fitting.settings import FitSettings
 from sgwarp.runs.interrupt import deferred_interrupt
+from sgwarp.runs.isolation import isolated
 from sgwarp.runs.log import RunLog
 from sgwarp.runs.progress import Report
 from sgwarp.runs.seeds import generator, view_at
@@ -67,6 +68,7 @@ class Fitted:
     complete: bool
 
 
+@isolated
 def fit(
     views: Sequence[View],
     start: Gaussians | tuple[Any, Any] | None = None,
