@@ -99,7 +99,7 @@ def measure(room: Room, semantics: Semantics, encoder: TextEncoder | None = None
             mean, known = splat_scores(room.gaussians, view.camera, scores, semantics.seen)
             height, best = mean.max(dim=2)
             found = known & (height > NONE_LEVEL)
-        classes[view.stem] = torch.where(found, best.clamp(max=BACKGROUND), BACKGROUND)
+        classes[view.stem] = torch.where(found, best.clamp(max=BACKGROUND), BACKGROUND).cpu()
         confusion.add(classes[view.stem], room.truth[view.stem].clamp(max=BACKGROUND))
     findings = []
     if encoder is not None:  # the same order of pixels, on a scale that can be drawn
@@ -115,4 +115,4 @@ def measure(room: Room, semantics: Semantics, encoder: TextEncoder | None = None
 def _find(room: Room, semantics: Semantics, scores: Tensor, channel: int, view: View) -> Finding:
     pixel, score_map = localize(scores, room.gaussians, view.camera, seen=semantics.seen, box=BOX)
     hit = hits_mask(pixel, room.truth[view.stem] == channel)
-    return Finding(room.names[channel], view.stem, pixel, hit, score_map)
+    return Finding(room.names[channel], view.stem, pixel, hit, score_map.cpu())

@@ -229,8 +229,8 @@ def require_warp(device: torch.device) -> None:
     """
     if device.type == "cuda" and not wp.is_cuda_available():
         raise InputError(
-            f"{device}: Warp {wp.__version__} has no CUDA device here, though torch has one: it needs an NVIDIA driver "
-            f"of version {LEAST_DRIVER} or newer; update the driver, or compute on the CPU"
+            f"device {device}: Warp {wp.__version__} has no CUDA device here, though torch has one: it needs an NVIDIA "
+            f"driver of version {LEAST_DRIVER} or newer; update the driver, or compute on the CPU"
         )
 
 
@@ -242,7 +242,7 @@ def find_device(name: str | torch.device) -> torch.device:
     """
     match = re.fullmatch(r"cpu|cuda(?::(\d+))?", str(name))
     if match is None:
-        raise InputError(f"device '{name}': expected cpu, cuda or cuda:N")
+        raise InputError(f"device {name}: expected cpu, cuda or cuda:N")
     if str(name) == "cpu":
         return torch.device("cpu")
     if not torch.cuda.is_available():
