@@ -8,9 +8,11 @@ those of the block schedule on its fibers, and streams are checked but do not ru
 
 from __future__ import annotations
 
-import traceback
+import itertools
+import sys
 from collections import Counter
 from collections.abc import Callable, Iterator
+from concurrent.futures.thread import _WorkItem
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
@@ -122,10 +124,12 @@ class PretendedStream:
 
 
 class TorchStream:
-    """A stream of torch; `with torch.cuda.stream(stream):` makes it the current one."""
+    """A stream of torch; `with torch.cuda.stream(stream):` makes it the current one. The default one is number 0."""
 
-    def __init__(self, handle: int) -> None:
-        self.cuda_stream = handle
+    handles = itertools.count(1)
+
+    def __init__(self, handle: int | None = None) -> None:
+        self.cuda_stream = next(self.handles) if handle is None else handle
         self.device = CUDA
         self.device_index = 0
 
@@ -204,6 +208,8 @@ class PretendedDevice:
                 ours = False
             kwargs = kwargs | {"device": torch.device("cpu")}
         there = is_cuda(device) if device is not None else ours
+        if packet is aten._to_copy:  # moves to the CPU are made by the mode below
+            there = there or ours
         if tensors:
             self._recent = ours
         elif in_formula:
@@ -320,10 +326,10 @@ def _parsed_to(args: Any, kwargs: dict[str, Any]) -> tuple[Any, list[Any], dict[
 
 def _place() -> str:
     """The innermost line of the package that is running."""
-    for frame in reversed(traceback.extract_stack()):
-        if frame.filename.startswith(PACKAGE):
-            return f"{frame.filename[len(PACKAGE) + 1 :]}:{frame.lineno}"
-    return OUTSIDE
+    frame = sys._getframe(1)
+    while frame is not None and not frame.f_code.co_filename.startswith(PACKAGE):
+        frame = frame.f_back
+    return OUTSIDE if frame is None else f"{frame.f_code.co_filename[len(PACKAGE) + 1 :]}:{frame.f_lineno}"
 
 
 @contextmanager
@@ -333,7 +339,7 @@ def pretended_cuda() -> Iterator[PretendedDevice]:
     with pytest.MonkeyPatch.context() as patch:
         _pretend_torch(patch, device)
         _pretend_warp(patch, device)
-        _pretend_gradients(patch)
+        _pretend_gradients(patch, device)
         overwrites = torch.__future__.get_overwrite_module_params_on_conversion()
         torch.__future__.set_overwrite_module_params_on_conversion(True)
         try:
@@ -345,7 +351,6 @@ def pretended_cuda() -> Iterator[PretendedDevice]:
 
 
 def _pretend_torch(patch: pytest.MonkeyPatch, device: PretendedDevice) -> None:
-    handles = iter(range(1, 1 << 30))
     replaced = {
         "_lazy_init": lambda: None,
         "is_available": lambda: True,
@@ -354,24 +359,42 @@ def _pretend_torch(patch: pytest.MonkeyPatch, device: PretendedDevice) -> None:
         "set_device": lambda index: None,
         "synchronize": lambda *args: device.wait("synchronize"),
         "current_stream": lambda *args: device.stream,
-        "Stream": lambda *args, **kwargs: TorchStream(next(handles)),
+        "Stream": TorchStream,
         "stream": device.on_stream,
         "is_current_stream_capturing": lambda: device.is_capturing,
+        "get_rng_state": lambda *args: torch.get_rng_state(),
+        "set_rng_state": lambda *args: None,
     }
     for name, value in replaced.items():
         patch.setattr(torch.cuda, name, value)
+    save, load = torch.save, torch.load
+    patch.setattr(torch, "save", lambda content, *args, **kwargs: save(tree_map(plain, content), *args, **kwargs))
+
+    def loaded(*args: Any, map_location: Any = None, **kwargs: Any) -> Any:
+        content = load(*args, map_location="cpu", **kwargs)
+        return tree_map(claimed, content) if is_cuda(map_location) else content
+
+    patch.setattr(torch, "load", loaded)
+    work = _WorkItem.run
+
+    def run(item: Any) -> None:
+        with _Functions(device), _Dispatch(device):  # modes belong to a thread
+            work(item)
+
+    patch.setattr(_WorkItem, "run", run)
     autocast = torch.autocast
     patch.setattr(torch, "autocast", lambda kind, *args, **kwargs: autocast("cpu", *args, **kwargs))
 
 
-def _pretend_gradients(patch: pytest.MonkeyPatch) -> None:
+def _pretend_gradients(patch: pytest.MonkeyPatch, device: PretendedDevice) -> None:
     """The engine fills in zeros of the CPU for gradients that nobody gave; on a real device they would lie there."""
 
     def filled(backward: Callable[..., Any]) -> Callable[..., Any]:
         def run(ctx: Any, *gradients: Any) -> Any:
             known = (*gradients, *ctx.saved_tensors)
             ours = any(isinstance(tensor, DeviceTensor) for tensor in known)
-            return backward(ctx, *(claimed(g) if ours else g for g in gradients))
+            with _Functions(device):  # `Tensor.backward` is called by that mode, and so runs without it
+                return backward(ctx, *(claimed(g) if ours else g for g in gradients))
 
         return run
 

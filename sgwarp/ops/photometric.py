@@ -77,9 +77,9 @@ def _loss_and_gradient(image: Tensor, truth: Tensor, share: float) -> tuple[Tens
     inputs = [averaged.shifted, *pair, floats, (1.0 - share) / count, -share / count]
     outputs = [view(gradient, wp.float32), view(rows[1], wp.float32)]
     launch(kernels.gather_gradient, height, inputs, outputs, device=device, chunk=ROWS)
-    similarity, difference = (rows.cpu().to(torch.float64).sum(dim=1) / count).tolist()
+    similarity, difference = rows.to(torch.float64).sum(dim=1) / count
     loss = (1.0 - share) * difference + share * (1.0 - similarity)
-    return torch.tensor(loss, dtype=torch.float32, device=device), gradient.view(image.shape)
+    return loss.to(torch.float32), gradient.view(image.shape)
 
 
 ROWS = 16  # of an image that a host thread takes at once
