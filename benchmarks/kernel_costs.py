@@ -73,9 +73,7 @@ def subjects() -> list[Subject]:
         Subject("backward, colours and depth", replay(False, True, True, False), 16, (replayed,)),
         Subject("backward, in order", replay(False, True, True, True), 16, (replayed,)),
         Subject("backward, 16 channels", replay(True, False, False, False), 16, (replayed, ("LDS.128", 64))),
-        Subject(
-            "lift 32 channels", lambda: lifting.make_lift_dense_block(False), 16, (replayed, ("FFMA", 32 * 16))
-        ),
+        Subject("lift 32 channels", lambda: lifting.make_lift_dense_block(False), 16, (replayed, ("FFMA", 32 * 16))),
         Subject("lift ids, one id", lambda: lifting.make_lift_ids_block(False), 16, (replayed,)),
         Subject("contributors", lambda: contributors.rank_contributors_block, 64, (alphas,)),
         Subject("loss", lambda: photometric_block.compare_tiles, items="tile"),

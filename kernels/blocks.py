@@ -12,7 +12,6 @@ wp.set_module_options({"enable_backward": False})
 BLOCK = 256  # threads, one per pixel of a tile
 
 
-
 @wp.func_native("t.data.ptr[place] = value;")
 def put(t: wp.tile[float], place: int, value: float): ...  # by one thread; the others see it after a barrier
 

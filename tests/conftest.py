@@ -28,6 +28,7 @@ def _load(name: str, path: Path):
 
 catalogue = _load("sgwarp_test_scenes", Path(__file__).with_name("scenes.py"))
 differences = _load("sgwarp_test_differences", Path(__file__).with_name("differences.py"))
+_pretended = _load("sgwarp_test_pretended", Path(__file__).with_name("pretended.py"))
 _stage = _load("sgwarp_test_stage", Path(__file__).with_name("stage.py"))
 stage, toy_text, stage_files = _stage.stage, _stage.toy_text, _stage.stage_files
 
@@ -60,6 +61,13 @@ def scenes():
 def assert_central_differences():
     """Compare gradients with central differences of a float64 loss."""
     return differences.assert_central_differences
+
+
+@pytest.fixture
+def pretended_cuda():
+    """A CUDA device that is not there, for the length of the test (tests/pretended.py)."""
+    with _pretended.pretended_cuda() as device:
+        yield device
 
 
 @contextmanager

@@ -32,7 +32,8 @@ def main(extras: str) -> int:
             print(f"requirements.lock: has no hashes of {', '.join(missing)}; run make lock", file=sys.stderr)
             return 1
         lines = [
-            f"{name}=={version} {' '.join(f'--hash={h}' for h in sorted(known[name, version]))}" for name, version in packages
+            f"{name}=={version} {' '.join(f'--hash={h}' for h in sorted(known[name, version]))}"
+            for name, version in packages
         ]
         listed = Path(folder) / "requirements.txt"
         listed.write_text("\n".join(lines) + "\n", encoding="utf-8")

@@ -22,7 +22,16 @@ HEADER = """# Every package that sgwarp and its extras install, direct and trans
 
 def main() -> int:
     # constraints.txt is resolved already; nothing is chosen anew.
-    options = "--universal --python-version 3.10 --no-deps --no-header --no-annotate --generate-hashes --quiet".split()
+    options = [
+        "--universal",
+        "--python-version",
+        "3.10",
+        "--no-deps",
+        "--no-header",
+        "--no-annotate",
+        "--generate-hashes",
+        "--quiet",
+    ]
     command = [sys.executable, "-m", "uv", "pip", "compile", *options, "constraints.txt"]
     made = subprocess.run(command, cwd=ROOT, check=False, stdout=subprocess.PIPE, text=True)
     if made.returncode:
@@ -30,7 +39,9 @@ def main() -> int:
     LOCK.write_text(HEADER + made.stdout, encoding="utf-8")
     lines = [line for folder in os.environ.get("PIP_FIND_LINKS", "").split() for line in _local(Path(folder))]
     if lines:
-        LOCAL.write_text("# Wheels with a local version, which no index has.\n" + "\n".join(lines) + "\n", encoding="utf-8")
+        LOCAL.write_text(
+            "# Wheels with a local version, which no index has.\n" + "\n".join(lines) + "\n", encoding="utf-8"
+        )
     print(f"{LOCK.name}: {len(entries(LOCK))} packages with their hashes")
     return 0
 

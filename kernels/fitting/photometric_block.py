@@ -32,7 +32,9 @@ def window_mean(values: wp.tile[float], start: int, step: int) -> float:
     """Weighted mean of the values under the window; the light ends come first, pair by pair, to round less."""
     total = float(0.0)
     for tap in range(RADIUS):
-        total += WINDOW[tap] * (wp.tile_extract(values, start + step * tap) + wp.tile_extract(values, start + step * (2 * RADIUS - tap)))
+        total += WINDOW[tap] * (
+            wp.tile_extract(values, start + step * tap) + wp.tile_extract(values, start + step * (2 * RADIUS - tap))
+        )
     return total + WINDOW[RADIUS] * wp.tile_extract(values, start + step * RADIUS)
 
 

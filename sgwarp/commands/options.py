@@ -23,8 +23,8 @@ if TYPE_CHECKING:
 
 @dataclass(kw_only=True)
 class Options:
-    device: Literal["cpu", "cuda"] = "cpu"
-    """Where to compute."""
+    device: str = "cpu"
+    """Where to compute: cpu, cuda (its current device) or cuda:N."""
 
     threads: int | None = None
     """Host threads on the CPU; all cores if not given."""
@@ -43,19 +43,21 @@ class Options:
         """Set the threads and the device.
 
         Raises:
-            InputError: There is no CUDA device, or the number of threads is not positive.
+            InputError: There is no such device, or the number of threads is not positive.
         """
         import torch
 
-        from sgwarp.ops.launcher import MAX_THREADS, get_threads, set_threads
+        from sgwarp.ops.launcher import MAX_THREADS, find_device, get_threads, set_threads
 
         if self.threads is not None:
             if not 1 <= self.threads <= MAX_THREADS:
                 raise InputError(f"--threads: expected 1 to {MAX_THREADS}, got {self.threads}")
             set_threads(self.threads)
             torch.set_num_threads(self.threads)
-        if self.device == "cuda" and not torch.cuda.is_available():
-            raise InputError("--device cuda: this machine or this torch has no CUDA device; use --device cpu")
+        try:
+            find_device(self.device)
+        except InputError as error:
+            raise InputError(f"--{error}") from None
         return RunLog(command=self.command_line, device=self.device, threads=get_threads())
 
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
 
@@ -55,6 +55,10 @@ class Room:
             load_views(folder / HELD_OUT),
             tuple(names[str(number)] for number in range(1, len(names))),
         )
+
+    def to(self, device: str) -> Room:
+        """The same room with its Gaussians there; photographs and labels stay on the CPU."""
+        return replace(self, gaussians=self.gaussians.to(device))
 
     @property
     def furniture(self) -> tuple[str, ...]:

@@ -89,7 +89,7 @@ def measure(room: Room, semantics: Semantics, encoder: TextEncoder | None = None
     classes = {}
     for view in room.held_out:
         best = best_texts(room.gaussians, view.camera, scores)
-        classes[view.stem] = torch.where(best >= 0, best.clamp(max=BACKGROUND), BACKGROUND)
+        classes[view.stem] = torch.where(best >= 0, best.clamp(max=BACKGROUND), BACKGROUND).cpu()
         confusion.add(classes[view.stem], room.truth[view.stem].clamp(max=BACKGROUND))
     findings = []
     for channel in range(FURNITURE):
@@ -104,4 +104,4 @@ def _find(room: Room, scores: TextScores, channel: int, view: View) -> Finding:
     column = scores.values[:, channel]
     pixel, score_map = localize(column, room.gaussians, view.camera, seen=scores.seen, box=BOX)
     hit = hits_mask(pixel, room.truth[view.stem] == channel)
-    return Finding(room.names[channel], view.stem, pixel, hit, score_map)
+    return Finding(room.names[channel], view.stem, pixel, hit, score_map.cpu())

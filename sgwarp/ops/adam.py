@@ -157,7 +157,7 @@ def update(
 def _update_wide(
     group: Group, gradient: Tensor, taken: Taken, columns: int, rate: float, leading: int, rate_of_rest: float
 ) -> None:
-    rates = torch.full((columns,), rate_of_rest)
+    rates = torch.full((columns,), rate_of_rest, device="cpu")
     rates[:leading] = rate
     shape = (len(taken.marks), columns // LANE, LANE)
     inputs = [view(taken.marks, wp.uint8), view(taken.moves, wp.vec2), view(taken.factors, wp.vec4)]

@@ -12,7 +12,7 @@ from sgwarp.errors import InputError
 from sgwarp.kernels.fitting import photometric_block
 from sgwarp.kernels.fitting import photometric_lanes as kernels
 from sgwarp.kernels.transmittance import LANES, Lanes
-from sgwarp.ops.launcher import launch, launch_blocks, scratch, view
+from sgwarp.ops.launcher import launch, launch_blocks, scratch, view, warp_device
 
 FLOAT_BYTES = 4
 
@@ -102,9 +102,9 @@ def _in_lanes(image: Tensor, truth: Tensor, share: float) -> tuple[Tensor, Tenso
     inputs = [averaged.shifted, *pair, floats, (1.0 - share) / count, -share / count]
     outputs = [view(gradient, wp.float32), view(rows[1], wp.float32)]
     launch(kernels.gather_gradient, height, inputs, outputs, device=device, chunk=ROWS)
-    similarity, difference = (rows.cpu().to(torch.float64).sum(dim=1) / count).tolist()
+    similarity, difference = rows.to(torch.float64).sum(dim=1) / count
     loss = (1.0 - share) * difference + share * (1.0 - similarity)
-    return torch.tensor(loss, dtype=torch.float32, device=device), gradient.view(image.shape)
+    return loss.to(torch.float32), gradient.view(image.shape)
 
 
 ROWS = 16  # of an image that a host thread takes at once
@@ -126,7 +126,7 @@ class _Planes:
             shape=(count, height, stride - LANES + 1),
             strides=(height * stride * FLOAT_BYTES, stride * FLOAT_BYTES, FLOAT_BYTES),
             capacity=memory.numel() * FLOAT_BYTES,
-            device=wp.device_from_torch(device),
+            device=warp_device(device),
         )
 
 

@@ -12,11 +12,13 @@ from sgwarp.encoders.base import TextEncoder
 from sgwarp.encoders.prompts import CANONICAL
 from sgwarp.errors import InputError
 from sgwarp.querying.ensembles import Ensemble, score_together, seen_by
+from sgwarp.runs.isolation import isolated
 from sgwarp.scene import Semantics
 
 CHUNK = 65536  # Gaussians scored at once: half precision features are widened chunk by chunk
 
 
+@isolated
 def query(semantics: Semantics, texts: Sequence[str], encoder: TextEncoder) -> Tensor:
     """Cosine of every Gaussian's feature with every text, float32 [N, Q]; 0 where nothing was seen.
 
@@ -26,6 +28,7 @@ def query(semantics: Semantics, texts: Sequence[str], encoder: TextEncoder) -> T
     return _cosines(semantics, _encode(semantics, texts, encoder))
 
 
+@isolated
 def relevancy(
     semantics: Semantics,
     texts: Sequence[str],
@@ -59,6 +62,7 @@ def standardise(scores: Tensor, seen: Tensor) -> Tensor:
     return torch.where(seen[:, None], scaled, 0.0).to(scores.dtype)
 
 
+@isolated
 def evidence(scores: Tensor, semantics: Semantics) -> Tensor:
     """Scores [N, Q] standardized over the scene and weighted by how well each Gaussian was seen.
 
@@ -103,6 +107,7 @@ TEMPERATURES: dict[Scoring, float] = {"evidence": 0.3, "cosine": 0.1}
 NONE_LEVEL = 1.0  # evidence of "none of these": a class must stand out further from the scene's mean
 
 
+@isolated
 def class_votes(
     semantics: Semantics,
     classes: Sequence[str] | None,

@@ -15,9 +15,16 @@ def require(condition: bool, message: str) -> None:
         raise InputError(message)
 
 
+def as_tensor(value: Any, dtype: torch.dtype | None = None) -> Tensor:
+    """The tensor where it is, anything else as a tensor of the CPU, whatever torch's default device."""
+    if isinstance(value, Tensor):
+        return value if dtype is None else value.to(dtype)
+    return torch.as_tensor(value, dtype=dtype, device="cpu")
+
+
 def float32(name: str, value: Any, shape: tuple[int | None, ...]) -> Tensor:
     """Convert to a contiguous float32 tensor of `shape` (None matches any size)."""
-    tensor = torch.as_tensor(value)
+    tensor = as_tensor(value)
     require(tensor.is_floating_point(), f"{name}: expected floating point values, got {tensor.dtype}")
     fits = tensor.ndim == len(shape) and all(w is None or w == s for w, s in zip(shape, tensor.shape, strict=False))
     wanted = ", ".join("any" if s is None else str(s) for s in shape)

@@ -29,11 +29,13 @@ from sgwarp.network.semantic_network import SemanticNetwork
 from sgwarp.network.training.data import CHUNK, Example, TrainingScene, make_example
 from sgwarp.network.training.processes import Processes
 from sgwarp.network.training.settings import DistillSettings, Epoch
+from sgwarp.runs.isolation import isolated
 from sgwarp.runs.log import RunLog
 from sgwarp.runs.progress import Report
 from sgwarp.scene import Semantics
 
 
+@isolated
 def distill(
     scenes: Sequence[TrainingScene],
     settings: DistillSettings | None = None,

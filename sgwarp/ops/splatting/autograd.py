@@ -83,6 +83,8 @@ def rasterize(
     n = len(means)
     if schedule not in (None, "lanes", "block"):
         raise InputError(f"schedule: expected 'lanes', 'block' or None, got '{schedule}'")
+    if schedule == "lanes" and means.is_cuda:
+        raise InputError("schedule 'lanes': is for tensors of the CPU; leave it out on CUDA")
     if features is not None:
         if not (features.ndim == 2 and len(features) == n and features.shape[1] > 0 and features.is_floating_point()):
             raise InputError(f"features: expected floating point [{n}, C], got {features.dtype} {list(features.shape)}")
@@ -98,15 +100,15 @@ def rasterize(
     inputs = (means, quats, scales, opacities, values, viewmat, means2d, background)
     if not (torch.is_grad_enabled() and any(t is not None and t.requires_grad for t in inputs)):
         colors = means.new_zeros(n, 1, 3) if sh is None else sh
-        gaussians = Gaussians(means, quats, scales, opacities, colors)
         return forward.rasterize(
-            gaussians,
+            _as_gaussians(means, quats, scales, opacities, colors),
             camera,
             features,
             background=background,
             expected_depth=expected_depth,
             depth=depth,
             settings=settings,
+            look=not means.is_cuda,
         )
     receives_absgrad = means2d if absgrad else None
     plan = plan_render(
@@ -132,6 +134,13 @@ def rasterize(
     if expected_depth:
         mean_depth = torch.where(alpha > 0, depth_sum / alpha.clamp(min=1e-12), 0.0)
     return Rendering(image, alpha, mean_depth, surface if depth else None, request.status_counts)
+
+
+def _as_gaussians(*fields: Tensor) -> Gaussians:
+    """The tensors as a scene; on CUDA unchecked, since to look at their values is to wait for the device."""
+    if not fields[0].is_cuda:
+        return Gaussians(*fields)
+    return Gaussians.unchecked(*(field.to(torch.float32).contiguous() for field in fields))
 
 
 def _check_fields(means: Tensor, quats: Tensor, scales: Tensor, opacities: Tensor) -> None:
@@ -160,7 +169,7 @@ class _Request:
     receives_absgrad: Tensor | None
     schedule: str | None
     deterministic: bool | None
-    status_counts: Tensor = field(default_factory=lambda: torch.empty(0, dtype=torch.int64))
+    status_counts: Tensor = field(default_factory=lambda: torch.empty(0, dtype=torch.int64, device="cpu"))
 
     @property
     def harmonics(self) -> bool:
@@ -187,6 +196,7 @@ class _Rasterize(torch.autograd.Function):
         gaussians = _gaussians(means, quats, scales, opacities, values, request)
         features = None if request.harmonics else values
         projected = tiles.project(gaussians, camera, settings)
+        tiles.leave_out_non_finite(projected, features)
         order = tiles.depth_order(projected)
         colors = packed_colors(gaussians, camera, features, order, request.plan)
         lists = tiles.bin_splats(projected, order, colors, camera, places=True, keep=True)

@@ -186,7 +186,16 @@ def _add_dense_pass(
         columns = -(-width // LANE)
         lanes = torch.nn.functional.pad(valid, (0, columns * LANE - width)).view(height, columns, 1, LANE)
         state = lane_scratch("state", TILE_ROWS, 1, device)
-        inputs = [*lists.arrays(), view(features, Lanes), view(lanes, Lanes), first_feature, knobs, width, height, state]
+        inputs = [
+            *lists.arrays(),
+            view(features, Lanes),
+            view(lanes, Lanes),
+            first_feature,
+            knobs,
+            width,
+            height,
+            state,
+        ]
         outputs = [view(rows, Lanes), view(weights, wp.float32)]
         kernel = lifting_lanes.make_lift_dense(count)
         launch(kernel, lists.tile_count, inputs, outputs, device=device, slots=True)

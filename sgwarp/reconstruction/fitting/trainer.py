@@ -39,6 +39,7 @@ from sgwarp.reconstruction.fitting.photographs import (
 )
 from sgwarp.reconstruction.fitting.settings import FitSettings
 from sgwarp.runs.interrupt import deferred_interrupt
+from sgwarp.runs.isolation import isolated
 from sgwarp.runs.log import RunLog
 from sgwarp.runs.progress import Report
 from sgwarp.runs.seeds import generator, view_at
@@ -67,6 +68,7 @@ class Fitted:
     complete: bool
 
 
+@isolated
 def fit(
     views: Sequence[View],
     start: Gaussians | tuple[Any, Any] | None = None,
@@ -201,8 +203,11 @@ class _Run:
         self.exposure = Exposure(len(photographs), device) if settings.exposure else None
         self.step = 0
         self.seconds = 0.0
-        self.loss = math.nan
-        self.psnr = math.nan  # of the photograph that was looked at last
+        # Steps leave these on the device and nobody reads them until they are shown: on CUDA to read is to wait.
+        self._loss = torch.full((), math.nan, dtype=torch.float64, device=device)
+        self._unseen = torch.zeros((), dtype=torch.int64, device=device)
+        self._looked_at: tuple[Tensor, Tensor, Tensor | None] | None = None
+        self._psnr = math.nan
         self.curve: list[Measurement] = []
 
     def begin(self, gaussians: Gaussians) -> None:
@@ -220,6 +225,16 @@ class _Run:
         self, report: Report, checkpoint: Path | None, checkpoint_every: int, interrupted: Callable[[], bool]
     ) -> bool:
         """Take the remaining steps; returns False if interrupted before the last one."""
+        try:
+            return self._go(report, checkpoint, checkpoint_every, interrupted)
+        finally:
+            self._settle()
+            self.log.leave_out("updates_of_unseen_gaussians", int(self._unseen))
+            self._unseen.zero_()
+
+    def _go(
+        self, report: Report, checkpoint: Path | None, checkpoint_every: int, interrupted: Callable[[], bool]
+    ) -> bool:
         settings = self.settings
         began, first = time.perf_counter(), self.step
         while self.step < settings.steps:
@@ -231,21 +246,41 @@ class _Run:
                 refine = self._take_step()
             # Before the refinement, as the reference does: it may have just made all Gaussians transparent.
             if self.step % settings.evaluate_every == 0 and self.step < settings.steps:
+                self._settle()
                 self.measure()
             with self._timed():
                 refine()
             if checkpoint is not None and self.step % checkpoint_every == 0 and self.step < settings.steps:
+                self._settle()
                 with self.log.stage("checkpoint"):
                     self.try_to_save(checkpoint)
         report(self.step, settings.steps, self._text((self.step - first) / max(time.perf_counter() - began, 1e-9)))
         return True
 
     @contextmanager
-    def _timed(self) -> Iterator[None]:
-        with self.log.stage("fit"):
-            before = time.perf_counter()
+    def _timed(self, wait: bool = False) -> Iterator[None]:
+        before = time.perf_counter()
+        with self.log.stage("fit", wait):
             yield
-            self.seconds += time.perf_counter() - before
+        self.seconds += time.perf_counter() - before
+
+    def _settle(self) -> None:
+        """Charge the steps, not what comes next, with what the device has yet to do."""
+        with self._timed(wait=True):
+            pass
+
+    @property
+    def loss(self) -> float:
+        """The running loss."""
+        return float(self._loss)
+
+    @property
+    def psnr(self) -> float:
+        """Of the photograph that was looked at last [dB]."""
+        if self._looked_at is not None:
+            self._psnr = psnr(*self._looked_at)
+            self._looked_at = None
+        return self._psnr
 
     def _take_step(self) -> Callable[[], None]:
         """Look at one photograph and update the Gaussians; the result refines their set."""
@@ -287,12 +322,12 @@ class _Run:
         taken = model.update(gradients, settings.means_rate_at(self.step, self.extent), settings)
         if self.exposure is not None and colour_map is not None and colour_map.grad is not None:
             self.exposure.update(index, colour_map.grad, share)
-        self.log.leave_out("updates_of_unseen_gaussians", len(model) - taken.count)
-        value = float(loss.detach())
-        self.loss = value if math.isnan(self.loss) else MEMORY * self.loss + (1 - MEMORY) * value
+        self._unseen += (taken.marks == 0).sum()
+        value = loss.detach().to(torch.float64)
+        self._loss = torch.where(self._loss.isnan(), value, MEMORY * self._loss + (1 - MEMORY) * value)
         self.step += 1
         if self.step % REPORT_EVERY == 0:
-            self.psnr = psnr(image.detach(), truth, photograph.mask)
+            self._looked_at = image.detach(), truth, photograph.mask
         return partial(self.strategy.after_step, model, self.step, gradients, taken, camera)
 
     def _background(self) -> Tensor | None:
@@ -352,7 +387,8 @@ class _Run:
             if self.exposure is not None:
                 self.exposure.restore(saved.exposure)
             self.step, self.seconds = saved.step, saved.seconds
-            (self.loss, self.psnr), *points = saved.curve
+            (loss, self._psnr), *points = saved.curve
+            self._loss.fill_(loss)
             self.curve = [Measurement(*point) for point in points]  # type: ignore[arg-type]
         except (KeyError, TypeError, ValueError):
             raise InputError(f"{path}: is damaged; start again without --resume") from None

@@ -268,7 +268,7 @@ def test_kernels_read_torch_memory_without_a_copy(make_scene):
 
 
 def test_colours_that_are_not_finite_are_marked_as_on_cuda(make_scene):
-    _, gaussians, camera = make_scene("sh3")
+    _, gaussians, _camera = make_scene("sh3")
     sh = gaussians.sh.clone()
     sh[3, 0, 1], sh[5, -1, 2], sh[8, 2, 0], sh[9] = torch.nan, torch.inf, -torch.inf, 3e38
     status = torch.arange(len(gaussians)).to(torch.uint8) % 5
