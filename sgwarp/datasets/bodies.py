@@ -20,8 +20,8 @@ class Body:
     """A body in its own axes, around the origin.
 
     Attributes:
-        kind: "ball" of radius size[0]; "box" with half edges `size`; "capsule" of radius size[0] and half length size[1]
-            along y, without its caps.
+        kind: "ball" of radius size[0]; "box" with half edges `size`; "capsule" along y of radius size[0] and, without
+            its caps, half length size[1].
         size: [m].
         label: Index of what it is.
         color: Red, green, blue in 0 to 1.
@@ -70,12 +70,14 @@ class Body:
     def _capsule_surface(self, directions: Tensor, random: torch.Generator) -> tuple[Tensor, Tensor]:
         radius, half = self.size
         count = len(directions)
-        # The side of a cylinder has the share half / (half + radius) of the surface; the two caps are a ball cut in two.
+        # Of the surface the side has the share half / (half + radius); the two caps are a ball cut in two.
         side = torch.rand(count, generator=random) < half / (half + radius)
         around = 2 * math.pi * torch.rand(count, generator=random)
         ring = torch.stack([torch.cos(around), torch.zeros(count), torch.sin(around)], dim=1)
         normals = torch.where(side[:, None], ring, directions)
-        along = torch.where(side, half * (2 * torch.rand(count, generator=random) - 1), half * torch.sign(normals[:, 1]))
+        along = torch.where(
+            side, half * (2 * torch.rand(count, generator=random) - 1), half * torch.sign(normals[:, 1])
+        )
         points = radius * normals
         points[:, 1] += along
         return points, normals
@@ -93,7 +95,9 @@ class Body:
             return _hit_ball(origin, directions, self.size[0])
         radius, half = self.size
         along = torch.tensor([0.0, half, 0.0], dtype=torch.float64)
-        caps = torch.minimum(_hit_ball(origin - along, directions, radius), _hit_ball(origin + along, directions, radius))
+        caps = torch.minimum(
+            _hit_ball(origin - along, directions, radius), _hit_ball(origin + along, directions, radius)
+        )
         return torch.minimum(caps, _hit_side(origin, directions, radius, half))
 
 

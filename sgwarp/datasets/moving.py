@@ -101,7 +101,7 @@ class MovingScene:
         return Gaussians(means, quats, self.scales, self.opacities, ((rgb - 0.5) / SH_C0)[:, None])
 
     def truth(self, frame: int, camera: Camera) -> Tensor:
-        """What each pixel's ray hits first: label + 1, 0 for nothing, int64 [H, W]; from the bodies, not the Gaussians."""
+        """What each pixel's ray hits first, label + 1 or 0, int64 [H, W]; of the bodies, not of their Gaussians."""
         x = (torch.arange(camera.width, dtype=torch.float64) + 0.5 - camera.K[0, 2]) / camera.K[0, 0]
         y = (torch.arange(camera.height, dtype=torch.float64) + 0.5 - camera.K[1, 2]) / camera.K[1, 1]
         columns, rows = torch.meshgrid(x, y, indexing="xy")
@@ -208,7 +208,7 @@ def make_moving_scene(
     areas = torch.tensor([body.area for body in bodies])
     shares = areas / areas.sum()
     moves = torch.arange(len(bodies)) >= STILL_BODIES
-    if moving_share is not None and 0 < moving_share:
+    if moving_share is not None and moving_share > 0:
         shares[moves] *= moving_share / shares[moves].sum()
         shares[~moves] *= (1 - moving_share) / shares[~moves].sum()
     edges = (shares.cumsum(0) * count).round().long()
@@ -256,10 +256,10 @@ def _quaternions(rotations: Tensor) -> Tensor:
         if k == 0:
             q = torch.stack([1 + R.trace(), R[2, 1] - R[1, 2], R[0, 2] - R[2, 0], R[1, 0] - R[0, 1]])
         else:
-            i, j, l = k - 1, k % 3, (k + 1) % 3
+            i, j, m = k - 1, k % 3, (k + 1) % 3
             q = torch.empty(4, dtype=torch.float64)
-            q[0], q[1 + i] = R[l, j] - R[j, l], 1 + R[i, i] - R[j, j] - R[l, l]
-            q[1 + j], q[1 + l] = R[j, i] + R[i, j], R[l, i] + R[i, l]
+            q[0], q[1 + i] = R[m, j] - R[j, m], 1 + R[i, i] - R[j, j] - R[m, m]
+            q[1 + j], q[1 + m] = R[j, i] + R[i, j], R[m, i] + R[i, m]
         quats[row] = q / q.norm()
     return quats
 

@@ -45,7 +45,9 @@ def point_tracking(
         InputError: The shapes differ, or nothing is visible.
     """
     if predicted.shape != truth.shape or truth.ndim != 3 or (visible is not None and visible.shape != truth.shape[:2]):
-        raise InputError(f"trajectories: expected two of shape [T, K, D], got {list(predicted.shape)}, {list(truth.shape)}")
+        raise InputError(
+            f"trajectories: expected two of shape [T, K, D], got {list(predicted.shape)}, {list(truth.shape)}"
+        )
     error = (predicted.double() - truth.double()).norm(dim=2).nan_to_num(nan=torch.inf)
     seen = torch.ones_like(error, dtype=torch.bool) if visible is None else visible
     known = seen.any(dim=0)

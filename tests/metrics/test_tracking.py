@@ -33,7 +33,9 @@ def test_point_tracking_by_hand():
 
 
 def test_points_that_are_lost_or_hidden():
-    predicted = torch.cat([along(0.0, 60.0, 0.0, 0.0), along(2.5, math.nan, 2.5, 2.5), along(9.0, 9.0, 9.0, 9.0)], dim=1)
+    predicted = torch.cat(
+        [along(0.0, 60.0, 0.0, 0.0), along(2.5, math.nan, 2.5, 2.5), along(9.0, 9.0, 9.0, 9.0)], dim=1
+    )
     visible = torch.ones(4, 3, dtype=torch.bool)
     visible[1, 1] = False  # where the second is NaN
     visible[:, 2] = False  # the third is never seen

@@ -106,6 +106,9 @@ class Tracker:
         gaussians = frame.gaussians.to(self.settings.device)
         with self.log.stage("lift"):
             self._lift.begin(gaussians)
+        observe = getattr(self.source, "observe", None)
+        if observe is not None:
+            observe(gaussians)
         for view in views:
             self._add(frame.index, view, gaussians)
         with self.log.stage("lift"):

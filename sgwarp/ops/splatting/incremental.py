@@ -1,10 +1,10 @@
 """Lifting frame after frame of a moving scene, leaving out what did not change.
 
-Kept of every view, on the CPU: its splats (64 bytes per Gaussian), its tile lists (4 bytes per intersection), the id map
-(4 bytes per pixel) with the ids of each tile (1 kB per tile), and for every intersection one weight (4 bytes) for each
-id of its tile. Of all Gaussians, those that changed are projected again; of all tiles, those are merged and walked again
-where such a Gaussian lies or lay, or where the id map differs; of all sums over the views, those are added up again
-whose Gaussians lie in such tiles. They are added in the same order as by `lift_view`, so the result has the same bits.
+Kept of every view, on the CPU: its splats (64 bytes per Gaussian), its tile lists (4 bytes per intersection), the id
+map (4 bytes per pixel) with the ids of each tile (1 kB per tile), and for every intersection one weight (4 bytes) for
+each id of its tile. Only Gaussians that changed are projected again. Only tiles are merged and walked again where such
+a Gaussian lies or lay, or where the id map differs. Only sums of Gaussians in such tiles are added up again, in the
+same order as by `lift_view`: the result has the same bits.
 
 Dense maps are lifted in full whenever they are given: their sums, one row of features per intersection, would not fit
 into memory. So is everything on CUDA, and every frame in which more than `rebuild_above` of the Gaussians changed.
@@ -193,9 +193,8 @@ class IncrementalLift:
             return self._sums
         for key in [key for key in self._kept if key not in self._seen]:
             self._mark(self._kept.pop(key))
-        if self._seen != [key for key in self._order if key in self._seen][: len(self._seen)] and self._order:
-            if set(self._seen) & set(self._order):  # the order of additions differs, and with it the rounding
-                self._affected.fill_(1)
+        if [k for k in self._seen if k in self._order] != [k for k in self._order if k in self._seen]:
+            self._affected.fill_(1)  # the order of additions differs, and with it the rounding
         self._order = list(self._seen)
         self._add_up()
         return self._sums
