@@ -14,6 +14,7 @@ from sgwarp.commands.query import Query
 from sgwarp.commands.render import Render
 from sgwarp.commands.report import Report
 from sgwarp.commands.segment import Segment
+from sgwarp.commands.track import Track
 
 COMMANDS = {
     "fit": Fit,
@@ -22,6 +23,7 @@ COMMANDS = {
     "predict": Predict,
     "query": Query,
     "segment": Segment,
+    "track": Track,
     "render": Render,
     "info": Info,
     "encoders": Encoders,

@@ -103,7 +103,7 @@ class Segment(SemanticsOptions):
         return [str(path), str(picture_path)]
 
 
-def class_names(text: str) -> list[str]:
+def class_names(text: str, option: str = "--classes") -> list[str]:
     """The names between the commas.
 
     Raises:
@@ -111,8 +111,8 @@ def class_names(text: str) -> list[str]:
     """
     names = [name.strip() for name in text.split(",")]
     if not all(names):
-        raise InputError(f"--classes {text!r}: name {names.index('') + 1} is empty")
+        raise InputError(f"{option} {text!r}: name {names.index('') + 1} is empty")
     twice = [name for name in names if names.count(name) > 1]
     if twice:
-        raise InputError(f"--classes {text!r}: '{twice[0]}' stands there twice")
+        raise InputError(f"{option} {text!r}: '{twice[0]}' stands there twice")
     return names

@@ -275,7 +275,9 @@ def _add_ids(
     local_ids = scratch("local ids", count * 256, torch.int32, device).view(count, TILE_ROWS, LANE)
     uniform = scratch("uniform rows", count * TILE_ROWS, torch.int32, device).view(count, TILE_ROWS)
     outputs = [view(tile_ids, wp.int32), view(id_counts, wp.int32), view(local_ids, LaneIds), view(uniform, wp.int32)]
-    launch(lifting.localize_ids, count, [view(ids, wp.int32), width, height], outputs, device=device)
+    every_tile = view(torch.empty(0, dtype=torch.int32, device=device), wp.int32)
+    inputs = [every_tile, view(ids, wp.int32), width, height]
+    launch(lifting.localize_ids, count, inputs, outputs, device=device)
     row_starts = torch.zeros(count + 1, dtype=torch.int32, device=device)
     row_starts[1:] = ((lists.offsets[1:] - lists.offsets[:-1]) * id_counts).cumsum(0)
 
@@ -305,7 +307,8 @@ def _add_ids(
         launch_blocks(kernel, [count], [*common, *labels, row_places, knobs, width, height], outputs, device=device)
     else:
         state = lane_scratch("state", TILE_ROWS, 1, device)
-        inputs = [*common, view(local_ids, LaneIds), view(uniform, wp.int32), row_places, knobs, width, height, state]
+        labels = [view(local_ids, LaneIds), view(uniform, wp.int32)]
+        inputs = [every_tile, *common, *labels, row_places, knobs, width, height, state]
         outputs = [view(weights, wp.float32), view(starts, wp.int32)]
         launch(lifting_lanes.lift_ids, count, inputs, outputs, device=device, slots=True)
     vectors = None if feature_map.vectors is None else in_slices(feature_map.vectors.to(device))
