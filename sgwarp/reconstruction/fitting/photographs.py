@@ -19,7 +19,6 @@ from sgwarp.scene import Camera, View
 
 logger = logging.getLogger("sgwarp")
 LEAST_VIEWS = 3  # with fewer, nearly any scene explains them
-EXTENT_MARGIN = 1.1  # of the reference implementation
 
 Masks = Callable[[View], Any]
 
@@ -146,20 +145,29 @@ def require_enough(views: Sequence[View]) -> None:
 
 
 def require_overlap(photographs: Sequence[Photograph], means: Tensor, held_out: Sequence[Photograph] = ()) -> None:
-    """Raise InputError naming a photograph that shows none of the points [N, 3] that the scene starts from.
+    """Say how many photographs show none of the points [N, 3] that the scene starts from.
 
-    Of photographs that nothing is fitted to, only warn.
+    That may be right: features are rarely found in the sky, on a blank wall or a ceiling.
+
+    Raises:
+        InputError: No photograph shows any.
     """
     for blind in (p for p in held_out if not bool(_shown(p.camera, means).any())):
         logger.warning("held-out view %s shows none of the points to start from: is its pose right?", blind.stem)
     blinds = [p for p in photographs if not bool(_shown(p.camera, means).any())]
-    if blinds:
-        camera, first = blinds[0].camera, blinds[0].path or blinds[0].stem
+    if not blinds:
+        return
+    first = blinds[0].path or blinds[0].stem
+    if len(blinds) == len(photographs):
         raise InputError(
-            f"{first}: shows none of the {len(means)} points that the scene starts from, between "
-            f"{camera.near:g} and {camera.far:g} m of depth ({len(blinds)} of {len(photographs)} photographs do not); "
-            "correct its pose, remove it, or start without points (--init random)"
+            f"{first}: shows none of the {len(means)} points that the scene starts from, nor does any other "
+            "photograph; points and poses do not belong together: correct them, or start without points (--init random)"
         )
+    logger.warning(
+        "%d of %d photographs show none of the %d points to start from, first %s: right for sky or blank walls, else "
+        "correct their poses",
+        *(len(blinds), len(photographs), len(means), first),
+    )
 
 
 def _shown(camera: Camera, means: Tensor) -> Tensor:
@@ -170,13 +178,3 @@ def _shown(camera: Camera, means: Tensor) -> Tensor:
     x, y = pixels[:, 0] / points[:, 2], pixels[:, 1] / points[:, 2]
     inside = (x >= 0) & (x < camera.width) & (y >= 0) & (y < camera.height)
     return inside & (points[:, 2] > camera.near) & (points[:, 2] < camera.far)
-
-
-def camera_extent(views: Sequence[View]) -> float:
-    """Radius of the cameras around their centre [m], to which rates and sizes are relative; 1 if all are in one place.
-
-    As in the reference implementation, a tenth wider.
-    """
-    places = torch.stack([view.camera.position for view in views])
-    radius = float((places - places.mean(dim=0)).norm(dim=1).max())
-    return EXTENT_MARGIN * radius if radius > 1e-6 else 1.0

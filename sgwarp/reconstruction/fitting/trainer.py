@@ -25,14 +25,14 @@ from sgwarp.ops.splatting.forward import rasterize
 from sgwarp.reconstruction.fitting.checkpoint import Checkpoint, fingerprint
 from sgwarp.reconstruction.fitting.densify import Densify
 from sgwarp.reconstruction.fitting.exposure import Exposure
-from sgwarp.reconstruction.fitting.initial import RANDOM_SIZE, adapted, gaussians_from_points, random_points
+from sgwarp.reconstruction.fitting.frame import Frame
+from sgwarp.reconstruction.fitting.initial import adapted, gaussians_from_points, random_points
 from sgwarp.reconstruction.fitting.mcmc import MarkovChain
 from sgwarp.reconstruction.fitting.measurement import Measurement as Measurement
 from sgwarp.reconstruction.fitting.model import Gradients, Model
 from sgwarp.reconstruction.fitting.photographs import (
     Masks,
     Photograph,
-    camera_extent,
     read_photographs,
     require_enough,
     require_overlap,
@@ -45,7 +45,7 @@ from sgwarp.runs.seeds import generator, view_at
 from sgwarp.scene import Gaussians, View
 
 logger = logging.getLogger("sgwarp")
-LARGEST_NEAR = 0.01  # near plane [extent of the cameras]
+EXTENT = 1.0  # of the cameras, in the frame that scenes are fitted in
 REPORT_EVERY = 10  # steps between two reports of the progress
 MEMORY = 0.99  # of the loss that is reported
 
@@ -122,13 +122,14 @@ def fit(
         raise InputError("resume: name the file of the checkpoint")
     if checkpoint_every < 1:
         raise InputError(f"checkpoint_every: expected at least 1, got {checkpoint_every}")
-    extent = camera_extent(views)
+    frame = Frame.around(views)
     with log.stage("read"):
         photographs, shown = (
-            [_near_enough(p, extent) for p in read_photographs(v, downscale=downscale, masks=given, device=device)]
-            for v in (views, held_out)
+            read_photographs([*map(frame.view, group)], downscale=downscale, masks=given, device=device)
+            for group in (views, held_out)
         )
-    run = _Run(settings, photographs, shown, extent, torch.device(device), log)
+    require_enough(photographs)
+    run = _Run(settings, photographs, shown, EXTENT, torch.device(device), log)
     with log.stage("start"):
         if resume:
             assert path is not None
@@ -136,7 +137,7 @@ def fit(
         else:
             if path is not None and path.exists():
                 logger.warning("%s: is left from a run that did not end, and is replaced; --resume would go on", path)
-            run.begin(_starting(start, photographs, shown, views, settings, run.extent, device))
+            run.begin(_starting(start, photographs, shown, frame, settings, report))
     with deferred_interrupt() as interrupted:
         complete = run.go(report, path, checkpoint_every, interrupted)
     if path is not None:
@@ -144,36 +145,29 @@ def fit(
     measured = run.measure()
     if path is not None and complete and not keep_checkpoint:
         path.unlink(missing_ok=True)
-    return Fitted(run.model.gaussians(), run.curve, measured, complete)
-
-
-def _near_enough(photograph: Photograph, extent: float) -> Photograph:
-    """With a near plane that fits the scene, which may be smaller than one metre."""
-    camera = photograph.camera
-    return dataclasses.replace(
-        photograph, camera=dataclasses.replace(camera, near=min(camera.near, LARGEST_NEAR * extent))
-    )
+    return Fitted(frame.restored(run.model.gaussians()), run.curve, measured, complete)
 
 
 def _starting(
     start: Gaussians | tuple[Any, Any] | None,
     photographs: Sequence[Photograph],
     held_out: Sequence[Photograph],
-    views: Sequence[View],
+    frame: Frame,
     settings: FitSettings,
-    extent: float,
-    device: str | torch.device,
+    report: Report,
 ) -> Gaussians:
+    """What the first step sees, in the frame of the fit."""
+    device = photographs[0].pixels.device
     if isinstance(start, Gaussians):
-        gaussians = adapted(start, settings).to(device)
+        gaussians = adapted(frame.gaussians(start), settings).to(device)
         require_overlap(photographs, gaussians.means, held_out)
         return gaussians
     if start is None:
-        positions, colours = random_points(photographs, views, settings)
-        return gaussians_from_points(positions, colours, settings, extent, device, RANDOM_SIZE)
-    positions, colours = start
-    gaussians = gaussians_from_points(positions, colours, settings, extent, device)
-    require_overlap(photographs, torch.as_tensor(positions).to(torch.float32), held_out)  # before the cap thins them
+        positions, colours, size = random_points(photographs, settings, report)
+        return gaussians_from_points(positions, colours, settings, EXTENT, device, size)
+    positions, colours = frame.points(start[0]), start[1]
+    gaussians = gaussians_from_points(positions, colours, settings, EXTENT, device)
+    require_overlap(photographs, positions.to(torch.float32), held_out)  # before the cap thins them
     return gaussians
 
 
