@@ -19,6 +19,7 @@ from sgwarp.runs.progress import Report
 from sgwarp.scene import Camera, View
 
 NEIGHBORS = 20  # photographs that each is matched with
+LEAST_POINTS = 50  # that are worth starting from
 LEAST_COSINE = 0.3  # between the directions of view of two that are matched
 
 Points = tuple[NDArray[np.float64], NDArray[np.float32]]
