@@ -57,7 +57,12 @@ class Poses(Options):
 
 
 def find_poses(
-    source: Path, out: Path, log: RunLog, matching: str = "auto", one_camera: bool = True, every: int | None = None,
+    source: Path,
+    out: Path,
+    log: RunLog,
+    matching: str = "auto",
+    one_camera: bool = True,
+    every: int | None = None,
     seed: int = 0,
 ) -> Registration:
     """Run structure from motion on a folder or a video, and say what it could place.

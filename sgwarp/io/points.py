@@ -34,8 +34,8 @@ def load_points(path: str | os.PathLike[str], views: str | os.PathLike[str] | No
         views: Data set that a file of points belongs to: where `load_views` moves its cameras, they move, too.
 
     Returns:
-        Positions, float64 [N, 3], and colours in [0, 1], float32 [N, 3]. Points that are not finite are left out. Points
-        of a COLMAP model beside a transforms.json are brought into the world of its cameras (`applied_transform`).
+        Positions, float64 [N, 3], and colours in [0, 1], float32 [N, 3]. Points that are not finite are left out.
+        Those of a COLMAP model beside a transforms.json are brought into the world of its cameras (`applied_transform`).
 
     Raises:
         InputError: There is no such file, or it holds no points.

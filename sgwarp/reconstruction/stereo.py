@@ -8,7 +8,6 @@ photographs contradict are dropped. No features, no network: what remains in eve
 from __future__ import annotations
 
 import math
-import os
 from collections.abc import Iterable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
@@ -17,6 +16,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from sgwarp.ops.launcher import get_threads
 from sgwarp.runs.progress import Report
 from sgwarp.scene import Camera
 
@@ -83,8 +83,8 @@ def estimate_depth(
         others = [(gray[other], cameras[other]) for other in neighbors[index]]
         return _best(_costs(gray[index], cameras[index], others, planes), planes)
 
-    depths = []
-    with ThreadPoolExecutor(os.cpu_count()) as pool:  # NumPy and OpenCV let go of the interpreter
+    depths: list[Array] = []
+    with ThreadPoolExecutor(get_threads()) as pool:  # NumPy and OpenCV let go of the interpreter
         for depth in pool.map(depth_of, range(len(small))):
             report(len(depths), len(small), "comparing photographs")
             depths.append(depth)

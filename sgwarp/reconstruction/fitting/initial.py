@@ -31,6 +31,7 @@ LEAST_DISTANCE = 1e-4  # [extent of the cameras], for points in the same place
 VISIBLE = 1 / 255  # opacity from which on a Gaussian changes a pixel
 LEAST_POINTS = 4  # that three neighbours need
 RANDOM_COUNT = 50_000
+SHARE_OF_CAP = 2  # so much of the cap is left to the fit: the half
 LEAST_CERTAIN = 500  # depths that are worth starting from
 NEAREST, FARTHEST = 0.2, 4.0  # of points anywhere [extent of the cameras]
 MILLIMETRE = 1e-3  # [m], the unit of depth images
@@ -106,24 +107,42 @@ def random_points(
         Positions, float64 [N, 3], colors in [0, 1], float32 [N, 3], and the size of Gaussians there, in root mean
         square distances to the three nearest others.
     """
-    count = min(settings.cap, RANDOM_COUNT)
+    count = min(settings.cap // SHARE_OF_CAP, RANDOM_COUNT)
     random = generator(settings.seed, 0, "random points")
+    places, colors = _points_where_photographs_agree(photographs, count, random, progress)
+    if len(places) >= LEAST_CERTAIN:
+        return places, colors, SIZE
+    logger.warning("start: the photographs agree nowhere, so points lie anywhere in view; the fit may end in fog")
+    return *_points_anywhere(photographs, count, random), RANDOM_SIZE
+
+
+def completed(
+    positions: Tensor, colors: Any, photographs: Sequence[Photograph], settings: FitSettings, progress: Report
+) -> tuple[Tensor, Tensor]:
+    """Few points, such as features leave them, and more of those where photographs agree, up to half the cap."""
+    random = generator(settings.seed, 0, "more points")
+    count = min(settings.cap // SHARE_OF_CAP, RANDOM_COUNT) - len(positions)
+    more, their_colors = _points_where_photographs_agree(photographs, count, random, progress)
+    logger.info("start: %d points are few; %d are added where photographs agree", len(positions), len(more))
+    own = torch.as_tensor(colors).to(torch.float32)
+    return torch.cat([positions, more]), torch.cat([own, their_colors])
+
+
+def _points_where_photographs_agree(
+    photographs: Sequence[Photograph], count: int, random: torch.Generator, progress: Report | None
+) -> tuple[Tensor, Tensor]:
+    """At most `count` pixels at their depth, and their colors."""
     images = (photograph.image().cpu().numpy() for photograph in photographs)
     maps = estimate_depth(images, [photograph.camera for photograph in photographs], 1.0, progress)
     places = torch.from_numpy(np.concatenate([m.points[m.known.reshape(-1)] for m in maps]))
     colors = torch.from_numpy(np.concatenate([m.colors[m.known] for m in maps]))
     share = sum(float(m.known.mean()) for m in maps) / len(maps)
     logger.info("start: the photographs agree on the depth of %.0f %% of their pixels", 100 * share)
-    if len(places) >= LEAST_CERTAIN:
-        chosen = torch.randperm(len(places), generator=random)[:count].sort().values
-        return places[chosen], colors[chosen], SIZE
-    logger.warning("start: the photographs agree nowhere, so points lie anywhere in view; the fit may end in fog")
-    return *_points_anywhere(photographs, count, random), RANDOM_SIZE
+    chosen = torch.randperm(len(places), generator=random)[:count].sort().values
+    return places[chosen], colors[chosen]
 
 
-def _points_anywhere(
-    photographs: Sequence[Photograph], count: int, random: torch.Generator
-) -> tuple[Tensor, Tensor]:
+def _points_anywhere(photographs: Sequence[Photograph], count: int, random: torch.Generator) -> tuple[Tensor, Tensor]:
     """Points at random pixels and distances in front of the cameras."""
     positions, colors = [], []
     for index, photograph in enumerate(photographs):

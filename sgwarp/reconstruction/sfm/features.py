@@ -39,9 +39,7 @@ class SfmSettings:
     threads: int = -1
 
 
-def extract_features(
-    database: Path, folder: Path, names: Sequence[str], settings: SfmSettings, report: Report
-) -> None:
+def extract_features(database: Path, folder: Path, names: Sequence[str], settings: SfmSettings, report: Report) -> None:
     """Store the features of photographs; those that are stored already are skipped.
 
     Raises:

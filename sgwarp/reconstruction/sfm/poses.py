@@ -123,32 +123,15 @@ def _readable(path: Path) -> bool:
 
 def _map(database: Path, folder: Path, out: Path, settings: SfmSettings, count: int, report: Report) -> Any:
     """The largest model that COLMAP can make."""
-    pycolmap = require_pycolmap()
+    options = require_pycolmap().IncrementalPipelineOptions()
+    options.random_seed, options.num_threads = settings.seed, settings.threads
+    options.min_model_size = LEAST_PHOTOGRAPHS
     work = out / "mapping"
-    for least_angle in (None, LEAST_ANGLE):
-        shutil.rmtree(work, ignore_errors=True)
-        work.mkdir()
-        options = pycolmap.IncrementalPipelineOptions()
-        options.random_seed, options.num_threads = settings.seed, settings.threads
-        options.min_model_size = LEAST_PHOTOGRAPHS
-        if least_angle is not None:
-            options.mapper.init_min_tri_angle = least_angle
-            options.mapper.init_min_num_inliers = FEW_MATCHES
-        placed = 2
-
-        def note() -> None:
-            nonlocal placed
-            placed += 1
-
-        def run(token: Any, options: Any = options, note: Any = note) -> Any:
-            return pycolmap.incremental_mapping(
-                database, folder, work, options=options, next_image_callback=note, cancellation_token=token
-            )
-
-        models = run_cancellable(run, lambda: report(min(placed, count), count, "placing photographs"))
-        if models:
-            break
-    shutil.rmtree(work, ignore_errors=True)
+    models = _attempt(database, folder, work, options, count, report)
+    if not models:
+        options.mapper.init_min_tri_angle = LEAST_ANGLE
+        options.mapper.init_min_num_inliers = FEW_MATCHES
+        models = _attempt(database, folder, work, options, count, report)
     if not models:
         raise InputError(
             f"{folder}: no two photographs overlap enough to place them; take more of them, closer together, sharp, "
@@ -164,7 +147,30 @@ def _map(database: Path, folder: Path, out: Path, settings: SfmSettings, count: 
     return ordered[0]
 
 
-def _reasons(database: Path, names: Sequence[str], readable: Sequence[str], registered: Sequence[str]) -> dict[str, str]:
+def _attempt(database: Path, folder: Path, work: Path, options: Any, count: int, report: Report) -> Any:
+    """Models by number; none if no two photographs can be placed."""
+    pycolmap = require_pycolmap()
+    shutil.rmtree(work, ignore_errors=True)
+    work.mkdir()
+    placed = 2
+
+    def note() -> None:
+        nonlocal placed
+        placed += 1
+
+    def run(token: Any) -> Any:
+        return pycolmap.incremental_mapping(
+            database, folder, work, options=options, next_image_callback=note, cancellation_token=token
+        )
+
+    models = run_cancellable(run, lambda: report(min(placed, count), count, "placing photographs"))
+    shutil.rmtree(work, ignore_errors=True)
+    return models
+
+
+def _reasons(
+    database: Path, names: Sequence[str], readable: Sequence[str], registered: Sequence[str]
+) -> dict[str, str]:
     """Why photographs have no pose, as far as the database tells."""
     pycolmap = require_pycolmap()
     reasons = {name: "cannot be read" for name in set(names) - set(readable)}
@@ -175,8 +181,8 @@ def _reasons(database: Path, names: Sequence[str], readable: Sequence[str], regi
         for number in pycolmap.pair_id_to_image_pair(pair):
             best[number] = max(best.get(number, 0), len(geometry.inlier_matches))
     for name in set(readable) - set(registered):
-        number = images.get(name)
-        features = 0 if number is None else data.num_keypoints_for_image(number)
+        number = images.get(name, 0)
+        features = data.num_keypoints_for_image(number) if number else 0
         if features < FEW_FEATURES:
             reasons[name] = f"only {features} features: blurred, dark, or of something even"
         elif best.get(number, 0) < FEW_MATCHES:

@@ -88,8 +88,8 @@ class _Model:
         library = self.library
         groups: dict[tuple[float, ...], list[str]] = defaultdict(list)
         for name, camera in zip(self.names, self.cameras, strict=True):
-            K = camera.K
-            groups[float(K[0, 0]), float(K[1, 1]), float(K[0, 2]), float(K[1, 2]), *camera.size].append(name)
+            intrinsics = (*camera.K.diagonal()[:2].tolist(), *camera.K[:2, 2].tolist(), *camera.size)
+            groups[intrinsics].append(name)
         data = library.Database.open(self.database)
         for number, (fx, fy, cx, cy, height, width) in enumerate(groups, start=1):
             lens = library.Camera(
@@ -176,5 +176,4 @@ def _pairs(cameras: Sequence[Camera]) -> set[tuple[int, int]]:
     apart[axes @ axes.T < LEAST_COSINE] = np.inf
     np.fill_diagonal(apart, np.inf)
     order = np.argsort(apart, axis=1, kind="stable")[:, :NEIGHBORS]
-    found = {(min(a, int(b)), max(a, int(b))) for a in range(len(cameras)) for b in order[a] if apart[a, b] < np.inf}
-    return found
+    return {(min(a, int(b)), max(a, int(b))) for a in range(len(cameras)) for b in order[a] if apart[a, b] < np.inf}

@@ -83,5 +83,6 @@ def _sharpness(frame: np.ndarray) -> float:
     height, width = frame.shape[:2]
     factor = min(1.0, SMALL / width)
     gray = cv2.cvtColor(frame, cv2.COLOR_BGR2GRAY)
-    small = cv2.resize(gray, (max(1, round(factor * width)), max(1, round(factor * height))), interpolation=cv2.INTER_AREA)
+    size = (max(1, round(factor * width)), max(1, round(factor * height)))
+    small = cv2.resize(gray, size, interpolation=cv2.INTER_AREA)
     return float(cv2.Laplacian(small, cv2.CV_32F).var())
