@@ -113,8 +113,11 @@ def _notices() -> Iterator[None]:
     """Show on stderr what readers log, such as columns or photographs that they left out."""
     logger, handler = logging.getLogger("sgwarp"), logging.StreamHandler()
     handler.setFormatter(_Plain("sgwarp: %(message)s"))
+    level = logger.level
     logger.addHandler(handler)
+    logger.setLevel(logging.INFO)
     try:
         yield
     finally:
         logger.removeHandler(handler)
+        logger.setLevel(level)

@@ -10,7 +10,7 @@ from functools import cache
 import warp as wp
 
 from sgwarp.kernels.binning import TILE
-from sgwarp.kernels.blocks import BLOCK, power_of_two
+from sgwarp.kernels.blocks import power_of_two
 from sgwarp.kernels.gaussian import Splat
 from sgwarp.kernels.projection.forward import Knobs
 from sgwarp.kernels.transmittance import BLOCK_OPTIONS, LANES, Lanes, attenuated, contribution

@@ -9,6 +9,7 @@ from sgwarp.commands.encoders import Encoders
 from sgwarp.commands.fit import Fit
 from sgwarp.commands.info import Info
 from sgwarp.commands.lift import Lift
+from sgwarp.commands.poses import Poses
 from sgwarp.commands.predict import Predict
 from sgwarp.commands.query import Query
 from sgwarp.commands.render import Render
@@ -17,6 +18,7 @@ from sgwarp.commands.segment import Segment
 from sgwarp.commands.track import Track
 
 COMMANDS = {
+    "poses": Poses,
     "fit": Fit,
     "lift": Lift,
     "distill": Distill,

@@ -153,15 +153,17 @@ def load_on(path: Path, gaussians: Gaussians) -> Semantics:
     return replace(semantics, **{name: getattr(semantics, name).to(gaussians.device) for name in names})
 
 
-def find_views(folder: Path, stem: str | None = None, photographs: bool = True) -> list[View]:
-    """All views of a folder, or the one named `stem`.
+def find_views(
+    folder: Path, stem: str | None = None, photographs: bool = True, images: str | None = None
+) -> list[View]:
+    """All views of a folder, or the one named `stem`; `images` names a COLMAP model's folder of photographs.
 
     Raises:
         InputError: The folder holds no views, or none of that name.
     """
     from sgwarp.io.views import load_views
 
-    views = load_views(folder, photographs=photographs)
+    views = load_views(folder, images, photographs)
     if stem is None:
         return views
     chosen = [view for view in views if view.stem == stem]

@@ -44,6 +44,9 @@ class Query(SemanticsOptions):
     box: int = 9
     """Side of the box over which scores are averaged before the best pixel is taken [pixels]."""
 
+    images: str | None = None
+    """Name of a COLMAP model's folder of photographs, if it is not `images` nor the only one that holds them."""
+
     def run(self) -> None:
         check_name("--out", self.out, ".png")
         if not self.text.strip():
@@ -59,7 +62,7 @@ class Query(SemanticsOptions):
 
             gaussians, semantics = self.load_both(log)
             predicted = self.load_predicted(gaussians, log)
-            (view,) = find_views(self.views, self.view)
+            (view,) = find_views(self.views, self.view, images=self.images)
             scores = self._scores(semantics, predicted, log)
             with log.stage("splat"):
                 (x, y), score_map = localize(

@@ -45,6 +45,9 @@ class Render(SceneOptions):
     up: Literal["y-down", "y-up", "z-up", "z-down"] = "y-down"
     """Direction of the scene's axes, for the turn: y-down for most scenes from photographs."""
 
+    images: str | None = None
+    """Name of a COLMAP model's folder of photographs, if it is not `images` nor the only one that holds them."""
+
     def run(self) -> None:
         folder = self.out.parent if self.out.suffix == ".png" else self.out
         check_folder("--out", folder)
@@ -77,7 +80,7 @@ class Render(SceneOptions):
             return find_views(self.views, self.view, photographs=False)
         except InputError:
             # A file that gives no image size needs the photographs after all; else this fails for the same reason.
-            return find_views(self.views, self.view)
+            return find_views(self.views, self.view, images=self.images)
 
     def _write(self, path: Path, image: Tensor) -> list[str]:
         """The picture, and for depth the numbers; returns their paths."""

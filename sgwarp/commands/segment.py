@@ -42,6 +42,9 @@ class Segment(SemanticsOptions):
     unknown_below: float = 0.0
     """Pixels whose best class has a smaller confidence are unknown, 0 to 1."""
 
+    images: str | None = None
+    """Name of a COLMAP model's folder of photographs, if it is not `images` nor the only one that holds them."""
+
     def run(self) -> None:
         check_folder("--out", self.out)
         if not 0.0 <= self.unknown_below <= 1.0:
@@ -54,7 +57,7 @@ class Segment(SemanticsOptions):
 
             gaussians, semantics = self.load_both(log)
             predicted = self.load_predicted(gaussians, log)
-            views = find_views(self.views, self.view)
+            views = find_views(self.views, self.view, images=self.images)
             encoder = None
             if classes is not None and semantics.labels is None:
                 with log.stage("load_encoder"):

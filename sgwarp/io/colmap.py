@@ -14,13 +14,14 @@ from sgwarp.errors import InputError
 from sgwarp.files.images import read_size
 from sgwarp.io.colmap_model import ImageRecord, find_model, read_cameras, read_images
 from sgwarp.io.colmap_model import read_points as read_points
+from sgwarp.io.image_folders import find_image_folder
 from sgwarp.io.names import inside
 from sgwarp.io.stems import unique_stems
 from sgwarp.io.undistort import Lens, pinhole_view
 from sgwarp.scene import View
 
 
-def read_colmap(path: str | os.PathLike[str], image_folder: str = "images", photographs: bool = True) -> list[View]:
+def read_colmap(path: str | os.PathLike[str], image_folder: str | None = None, photographs: bool = True) -> list[View]:
     """Read the registered images of a COLMAP reconstruction, sorted by name.
 
     Distorted photographs are undistorted when read (`View.undistort`), and the camera is that of the undistorted
@@ -30,7 +31,8 @@ def read_colmap(path: str | os.PathLike[str], image_folder: str = "images", phot
 
     Args:
         path: The data set (with sparse/0, sparse or colmap/sparse/0) or the folder of the model itself.
-        image_folder: Name of the folder of photographs; looked for beside the model and up to two levels above.
+        image_folder: Name or path of the folder of photographs, looked for beside the model and up to three levels
+            above; if None, `images`, or else the only folder that holds them.
         photographs: False to take the cameras alone; then no photograph is looked for.
 
     Raises:
@@ -42,11 +44,11 @@ def read_colmap(path: str | os.PathLike[str], image_folder: str = "images", phot
     if model is None:
         raise InputError(f"{path}: holds no COLMAP model (cameras.bin or cameras.txt in sparse/0, sparse or itself)")
     lenses = read_cameras(model)
-    folder = _find_images(model, image_folder) if photographs else None
+    records = read_images(model)
+    folder = find_image_folder(model, [record.name for record in records], image_folder) if photographs else None
     kept: list[tuple[ImageRecord, NDArray[np.float64], Path | None]] = []
     missing: list[str] = []
     unposed = 0
-    records = read_images(model)
     for record in records:
         if record.camera_id not in lenses:
             raise InputError(f"{model}: image {record.name!r} refers to camera {record.camera_id}, which is not listed")
@@ -75,16 +77,6 @@ def read_colmap(path: str | os.PathLike[str], image_folder: str = "images", phot
             lens = _fitted(lens, image)
         views.append(pinhole_view(f"{model}: image {record.name!r}", stem, lens, pose, image))
     return views
-
-
-def _find_images(model: Path, name: str) -> Path:
-    above = (model, *list(model.resolve().parents)[:3])
-    for folder in above:
-        if (folder / name).is_dir():
-            return folder / name
-    raise InputError(
-        f"{model}: no folder '{name}' of photographs beside the model or up to {above[-1]}; name it with image_folder"
-    )
 
 
 def _fitted(lens: Lens, image: Path) -> Lens:

@@ -15,6 +15,7 @@ from sgwarp.files.documents import read_json
 from sgwarp.io.colmap_model import find_model, read_points
 from sgwarp.io.names import inside
 from sgwarp.io.ply import POSITION, columns, read_elements
+from sgwarp.io.world import apply_transform, camera_places, far_origin, transform_of_points
 
 PLY_NAMES = ("points3D.ply", "sparse_pc.ply", "point_cloud.ply")  # beside a transforms.json that names none
 PLY_KEY = "ply_file_path"  # of nerfstudio's transforms.json
@@ -24,16 +25,18 @@ GREY = 0.5
 Points = tuple[NDArray[np.float64], NDArray[np.float32]]  # positions [N, 3] [m], colours [N, 3] in [0, 1]
 
 
-def load_points(path: str | os.PathLike[str]) -> Points:
+def load_points(path: str | os.PathLike[str], views: str | os.PathLike[str] | None = None) -> Points:
     """Read the points of a data set, or of one file.
 
     Args:
         path: What `load_views` takes: a folder with transforms.json (whose `ply_file_path` names the points, else
             points3D.ply, sparse_pc.ply or point_cloud.ply beside it) or with a COLMAP model; or a .ply, or a COLMAP
             points3D.bin or .txt.
+        views: Data set that a file of points belongs to: where `load_views` moves its cameras, they move, too.
 
     Returns:
         Positions, float64 [N, 3], and colours in [0, 1], float32 [N, 3]. Points that are not finite are left out.
+        Those of a COLMAP model beside a transforms.json are moved into the world of its cameras (`applied_transform`).
 
     Raises:
         InputError: There is no such file, or it holds no points.
@@ -54,7 +57,21 @@ def load_points(path: str | os.PathLike[str]) -> Points:
     finite = np.isfinite(positions).all(axis=1) & np.isfinite(colours).all(axis=1)
     if not finite.any():
         raise InputError(f"{source}: holds no finite points; export them again, or start without any")
-    return positions[finite], colours[finite].clip(0, 1)
+    return _placed(source, Path(views if views is not None else path), positions[finite]), colours[finite].clip(0, 1)
+
+
+def _placed(source: Path, data_set: Path, positions: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Points of a file in the coordinates that the cameras of their data set have once they are loaded."""
+    if data_set.is_file() and data_set.suffix.lower() != ".json":
+        return positions
+    transforms = data_set if data_set.is_file() else data_set / "transforms.json"
+    if transforms.is_file() and source.suffix.lower() != ".ply":
+        matrix = transform_of_points(transforms, read_json(transforms), source.parent)
+        if matrix is None:
+            raise InputError(f"{source}: its points do not belong to {transforms}; name others, or start without any")
+        positions = apply_transform(matrix, positions)
+    origin = far_origin(camera_places(data_set))
+    return positions if origin is None else positions - origin
 
 
 def find_points(path: str | os.PathLike[str]) -> Path | None:

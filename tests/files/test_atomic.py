@@ -60,9 +60,9 @@ def test_a_failed_write_is_one_error_and_leaves_nothing(tmp_path, disk):
     """The operating system itself refuses to let the file grow."""
     target = tmp_path / "out.txt"
     target.write_text("old")
-    with disk(8), pytest.raises(InputError, match=r"out\.txt: cannot be written \(File too large\)"):
-        with atomic_path(target) as temporary:
-            temporary.write_text("more than eight")
+    refused = pytest.raises(InputError, match=r"out\.txt: cannot be written \(File too large\)")
+    with disk(8), refused, atomic_path(target) as temporary:
+        temporary.write_text("more than eight")
     assert target.read_text() == "old"
     assert os.listdir(tmp_path) == ["out.txt"]
 

@@ -23,16 +23,17 @@ from sgwarp.ops.photometric import photometric_loss
 from sgwarp.ops.splatting.autograd import rasterize as rasterize_with_gradients
 from sgwarp.ops.splatting.forward import rasterize
 from sgwarp.reconstruction.fitting.checkpoint import Checkpoint, fingerprint
+from sgwarp.reconstruction.fitting.coverage import report_start, seen_by_any
 from sgwarp.reconstruction.fitting.densify import Densify
 from sgwarp.reconstruction.fitting.exposure import Exposure
-from sgwarp.reconstruction.fitting.initial import RANDOM_SIZE, adapted, gaussians_from_points, random_points
+from sgwarp.reconstruction.fitting.frame import Frame
+from sgwarp.reconstruction.fitting.initial import adapted, completed, gaussians_from_points, random_points
 from sgwarp.reconstruction.fitting.mcmc import MarkovChain
 from sgwarp.reconstruction.fitting.measurement import Measurement as Measurement
 from sgwarp.reconstruction.fitting.model import Gradients, Model
 from sgwarp.reconstruction.fitting.photographs import (
     Masks,
     Photograph,
-    camera_extent,
     read_photographs,
     require_enough,
     require_overlap,
@@ -46,7 +47,9 @@ from sgwarp.runs.seeds import generator, view_at
 from sgwarp.scene import Gaussians, View
 
 logger = logging.getLogger("sgwarp")
-LARGEST_NEAR = 0.01  # near plane [extent of the cameras]
+EXTENT = 1.0  # of the cameras, in the frame that scenes are fitted in
+FEW_POINTS = 20_000  # to start from, below which more are added where photographs agree
+MOST_MEASURED = 64  # of the fitted views
 REPORT_EVERY = 10  # steps between two reports of the progress
 MEMORY = 0.99  # of the loss that is reported
 
@@ -59,12 +62,15 @@ class Fitted:
         gaussians: The scene.
         curve: Measurements on the way, the last one of `gaussians`.
         held_out: PSNR of each held-out view by its stem [dB].
+        fitted_psnr: Mean PSNR of the views that it was fitted to [dB]; far above that of the held-out ones, it is
+            overfitted.
         complete: False if it was interrupted.
     """
 
     gaussians: Gaussians
     curve: list[Measurement]
     held_out: dict[str, float]
+    fitted_psnr: float
     complete: bool
 
 
@@ -76,6 +82,7 @@ def fit(
     settings: FitSettings | None = None,
     *,
     downscale: int = 1,
+    largest: int = 0,
     masks: Masks | Mapping[str, Any] | None = None,
     checkpoint: str | os.PathLike[str] | None = None,
     checkpoint_every: int = 1000,
@@ -96,6 +103,7 @@ def fit(
         held_out: Posed photographs to measure on; nothing is fitted to them.
         settings: Steps, strategy, cap and everything else.
         downscale: Divide width and height of the photographs by this.
+        largest: Photographs that are then wider or higher are scaled down to this [pixels]; 0 for none.
         masks: Which pixels of a view count, also of those held out, [H, W] of its photograph, zero for those that do
             not; by the name of the view, or a function of the view. A view without one counts as a whole.
         checkpoint: File to keep the state of the run in, every `checkpoint_every` steps and when interrupted; it is
@@ -124,13 +132,16 @@ def fit(
         raise InputError("resume: name the file of the checkpoint")
     if checkpoint_every < 1:
         raise InputError(f"checkpoint_every: expected at least 1, got {checkpoint_every}")
-    extent = camera_extent(views)
+    frame = Frame.around(views)
     with log.stage("read"):
         photographs, shown = (
-            [_near_enough(p, extent) for p in read_photographs(v, downscale=downscale, masks=given, device=device)]
-            for v in (views, held_out)
+            read_photographs(
+                [*map(frame.view, group)], downscale=downscale, largest=largest, masks=given, device=device
+            )
+            for group in (views, held_out)
         )
-    run = _Run(settings, photographs, shown, extent, torch.device(device), log)
+    require_enough(photographs)
+    run = _Run(settings, photographs, shown, EXTENT, torch.device(device), log)
     with log.stage("start"):
         if resume:
             assert path is not None
@@ -138,45 +149,43 @@ def fit(
         else:
             if path is not None and path.exists():
                 logger.warning("%s: is left from a run that did not end, and is replaced; --resume would go on", path)
-            run.begin(_starting(start, photographs, shown, views, settings, run.extent, device))
+            first = _starting(start, photographs, shown, frame, settings, report, device)
+            report_start(photographs, first.means, frame)
+            run.begin(first)
     with deferred_interrupt() as interrupted:
         complete = run.go(report, path, checkpoint_every, interrupted)
     if path is not None:
         run.try_to_save(path)
-    measured = run.measure()
+    if complete:
+        run.remove_unseen()
+    measured, on_fitted = run.measure(), run.measure_fitted()
     if path is not None and complete and not keep_checkpoint:
         path.unlink(missing_ok=True)
-    return Fitted(run.model.gaussians(), run.curve, measured, complete)
-
-
-def _near_enough(photograph: Photograph, extent: float) -> Photograph:
-    """With a near plane that fits the scene, which may be smaller than one metre."""
-    camera = photograph.camera
-    return dataclasses.replace(
-        photograph, camera=dataclasses.replace(camera, near=min(camera.near, LARGEST_NEAR * extent))
-    )
+    return Fitted(frame.restored(run.model.gaussians()), run.curve, measured, on_fitted, complete)
 
 
 def _starting(
     start: Gaussians | tuple[Any, Any] | None,
     photographs: Sequence[Photograph],
     held_out: Sequence[Photograph],
-    views: Sequence[View],
+    frame: Frame,
     settings: FitSettings,
-    extent: float,
+    report: Report,
     device: str | torch.device,
 ) -> Gaussians:
+    """What the first step sees, in the frame of the fit."""
     if isinstance(start, Gaussians):
-        gaussians = adapted(start, settings).to(device)
+        gaussians = adapted(frame.gaussians(start), settings).to(device)
         require_overlap(photographs, gaussians.means, held_out)
         return gaussians
     if start is None:
-        positions, colours = random_points(photographs, views, settings)
-        return gaussians_from_points(positions, colours, settings, extent, device, RANDOM_SIZE)
-    positions, colours = start
-    gaussians = gaussians_from_points(positions, colours, settings, extent, device)
-    require_overlap(photographs, torch.as_tensor(positions).to(torch.float32), held_out)  # before the cap thins them
-    return gaussians
+        positions, colours, size = random_points(photographs, settings, report)
+        return gaussians_from_points(positions, colours, settings, EXTENT, device, size)
+    positions, colours = frame.points(start[0]), start[1]
+    require_overlap(photographs, positions.to(torch.float32), held_out)  # before the cap thins them
+    if len(positions) < min(FEW_POINTS, settings.cap // 2):
+        positions, colours = completed(positions, colours, photographs, settings, report)
+    return gaussians_from_points(positions, colours, settings, EXTENT, device)
 
 
 class _Run:
@@ -217,9 +226,9 @@ class _Run:
     def _adopt(self, model: Model) -> None:
         self.model = model
         if self.settings.strategy == "mcmc":
-            self.strategy = MarkovChain(self.settings, self.extent)
+            self.strategy = MarkovChain(self.settings, self.extent, len(self.photographs))
         else:
-            self.strategy = Densify(self.settings, self.extent, len(model), self.device)
+            self.strategy = Densify(self.settings, self.extent, len(self.photographs), len(model), self.device)
 
     def go(
         self, report: Report, checkpoint: Path | None, checkpoint_every: int, interrupted: Callable[[], bool]
@@ -350,6 +359,25 @@ class _Run:
         if not self.curve or self.curve[-1].step != self.step:
             self.curve.append(Measurement(self.step, self.seconds, mean, self.loss, len(gaussians)))
         return values
+
+    def measure_fitted(self) -> float:
+        """Mean PSNR of the views that are fitted, of at most 64 of them [dB]."""
+        gaussians = self.model.gaussians()
+        background = torch.ones(3, device=self.device) if self.settings.background == "white" else None
+        chosen = self.photographs[:: 1 + (len(self.photographs) - 1) // MOST_MEASURED]
+        values = []
+        with self.log.stage("measure"):
+            for photograph in chosen:
+                image = rasterize(gaussians, photograph.camera, background=background).features
+                values.append(psnr(image, photograph.image(background), photograph.mask))
+        return sum(values) / len(values)
+
+    def remove_unseen(self) -> None:
+        """Remove the Gaussians that lie outside what the cameras can see: noise and moves have left them there."""
+        seen = seen_by_any(self.model.gaussians(), [photograph.camera for photograph in self.photographs])
+        if bool(seen.any()) and not bool(seen.all()):
+            self.log.leave_out("gaussians_no_camera_sees", int((~seen).sum()))
+            self.model.keep(seen)
 
     def _text(self, rate: float) -> str:
         held_out = f", held out {self.curve[-1].psnr:.2f} dB" if self.curve and self.held_out else ""
