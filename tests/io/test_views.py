@@ -75,9 +75,7 @@ def test_image_folder(tmp_path):
     with pytest.raises(InputError, match="no folder 'images' of photographs"):
         load_views(tmp_path)
     transforms(tmp_path, "x")
-    with pytest.raises(
-        InputError, match=r"transforms\.json: lists its photographs by path; image_folder is for COLMAP"
-    ):
+    with pytest.raises(InputError, match=r"transforms\.json: lists its photographs by path; --images is for COLMAP"):
         load_views(tmp_path, image_folder="photos")
 
 
