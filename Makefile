@@ -64,10 +64,15 @@ $(VENV)/installed-demo: EXTRAS = demo
 $(VENV)/installed-dev: EXTRAS = dev
 $(VENV)/installed-docs: EXTRAS = docs
 
-# One stamp per set of extras: installed again only when what is asked for changes.
+# One stamp per set of extras: installed again only when what is asked for changes. With HASHED=1, only files whose
+# hashes are in requirements.lock.
 $(VENV)/installed-%: pyproject.toml constraints.txt | $(BIN)/python
 	@echo "installing sgwarp[$(EXTRAS)] into $(VENV); the first time takes some minutes"
+ifdef HASHED
+	$(BIN)/python -m tools.install '$(EXTRAS)'
+else
 	$(BIN)/python -m pip install --disable-pip-version-check --quiet -c constraints.txt -e '.[$(EXTRAS)]'
+endif
 	@touch $@
 
 $(BIN)/python:

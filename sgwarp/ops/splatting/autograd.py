@@ -14,6 +14,7 @@ from sgwarp.ops.splatting.forward import Rendering, composite_recorded, packed_c
 from sgwarp.ops.splatting.plan import RenderPlan, plan_render
 from sgwarp.ops.splatting.settings import RasterSettings
 from sgwarp.scene import SH_COUNTS, Camera, Gaussians
+from sgwarp.scene.checks import dense
 
 
 def rasterize(
@@ -72,6 +73,21 @@ def rasterize(
         InputError: Shapes do not fit, or the camera is not valid; on the CPU also: a scale is negative or an opacity
             outside [0, 1].
     """
+    means, quats, scales, opacities, viewmat = (
+        dense(name, value)
+        for name, value in zip(
+            ("means", "quats", "scales", "opacities", "viewmat"),
+            (means, quats, scales, opacities, viewmat),
+            strict=True,
+        )
+    )
+    K = dense("K", K)
+    if means.ndim != 2:
+        raise InputError(f"means: expected floating point [N, 3], got {means.dtype} {list(means.shape)}")
+    sh, features, background, means2d = (
+        None if value is None else dense(name, value)
+        for name, value in (("sh", sh), ("features", features), ("background", background), ("means2d", means2d))
+    )
     if (sh is None) == (features is None):
         raise InputError("give exactly one of sh [N, K, 3] and features [N, C]")
     if means2d is not None and tuple(means2d.shape) != (len(means), 2):
