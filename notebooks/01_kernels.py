@@ -561,12 +561,14 @@ def lift_ids(lists, id_map, classes):
     """Weight of every class for each Gaussian, [N, classes]."""
     tile_ids, counts = wp.zeros((TILES, 256), dtype=int), wp.zeros(TILES, dtype=int)
     local_ids, uniform = wp.zeros((TILES, 16), dtype=LaneIds), wp.zeros((TILES, 16), dtype=int)
-    inputs = [0, wp.array(id_map, dtype=int), WIDTH, HEIGHT]
+    every_tile = wp.empty(0, dtype=int)
+    inputs = [0, every_tile, wp.array(id_map, dtype=int), WIDTH, HEIGHT]
     wp.launch(lifting.localize_ids, TILES, inputs, [tile_ids, counts, local_ids, uniform])
     row_starts = starts(np.diff(lists["offsets"].numpy()) * counts.numpy())
     weights, first_weights = wp.zeros(int(row_starts[-1]), dtype=float), wp.zeros(len(lists["tiles"]), dtype=int)
     state = wp.zeros((1, 16, 1), dtype=Lanes)
-    inputs = [0, 0, lists["offsets"], lists["listed"], lists["splats"], local_ids, uniform, wp.array(row_starts)]
+    inputs = [0, 0, every_tile, lists["offsets"], lists["listed"], lists["splats"]]
+    inputs += [local_ids, uniform, wp.array(row_starts)]
     wp.launch(lifting_lanes.lift_ids, TILES, [*inputs, knobs, WIDTH, HEIGHT, state], [weights, first_weights])
     sums = [wp.zeros((N, classes), dtype=float), wp.zeros(N, dtype=float), wp.zeros(N, dtype=float)]
     inputs = [0, lists["order"], lists["entries"], lists["places"], first_weights, lists["tiles"]]

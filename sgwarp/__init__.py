@@ -37,6 +37,9 @@ if TYPE_CHECKING:
     from sgwarp.querying.scores import relevancy as relevancy
     from sgwarp.querying.scores import select as select
     from sgwarp.querying.scores import standardise as standardise
+    from sgwarp.querying.scoring import TextScores as TextScores
+    from sgwarp.querying.scoring import best_texts as best_texts
+    from sgwarp.querying.scoring import score_texts as score_texts
     from sgwarp.querying.segmentation import localize as localize
     from sgwarp.querying.segmentation import segment as segment
     from sgwarp.reconstruction.depth import gaussians_from_depth as gaussians_from_depth
@@ -64,8 +67,10 @@ _HOME = {
     "RunLog": "sgwarp.runs.log",
     "SemanticNetwork": "sgwarp.network.semantic_network",
     "Semantics": "sgwarp.scene",
+    "TextScores": "sgwarp.querying.scoring",
     "TrainingScene": "sgwarp.network.training.data",
     "View": "sgwarp.scene",
+    "best_texts": "sgwarp.querying.scoring",
     "distill": "sgwarp.network.training.trainer",
     "evidence": "sgwarp.querying.scores",
     "fit": "sgwarp.reconstruction.fitting.trainer",
@@ -90,6 +95,7 @@ _HOME = {
     "save_network": "sgwarp.network.semantic_network",
     "save_semantics": "sgwarp.io.store",
     "scenes_in": "sgwarp.network.training.data",
+    "score_texts": "sgwarp.querying.scoring",
     "segment": "sgwarp.querying.segmentation",
     "select": "sgwarp.querying.scores",
     "standardise": "sgwarp.querying.scores",

@@ -5,15 +5,19 @@ Exit codes: 0 done, 2 bad input or usage (one line on stderr says what), 130 int
 
 from __future__ import annotations
 
+import io
 import logging
 import os
 import shlex
 import sys
 from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 
-from sgwarp.errors import InputError
+from sgwarp.errors import InputError, printable
+from sgwarp.runs.interrupt import termination_as_interrupt, was_terminated
 from sgwarp.version import __version__
+
+OUT_OF_MEMORY = ("can't allocate memory", "not enough memory", "out of memory")  # in messages of torch
 
 
 def main(argv: Sequence[str] | None = None) -> int:
@@ -22,7 +26,34 @@ def main(argv: Sequence[str] | None = None) -> int:
     Raises:
         SystemExit: After --help, or with code 2 if the arguments do not fit.
     """
-    argv = list(sys.argv[1:] if argv is None else argv)
+    _write_any_text()
+    try:
+        with termination_as_interrupt():
+            code = _run(list(sys.argv[1:] if argv is None else argv))
+        sys.stdout.flush()
+    except SystemExit:
+        _flush_quietly()
+        raise
+    except InputError as error:
+        return _fail(str(error), 2)
+    except KeyboardInterrupt:
+        return _fail("terminated", 143) if was_terminated() else _fail("interrupted", 130)
+    except BrokenPipeError:  # nobody reads any more: `sgwarp encoders | head -1`
+        _close_stdout()
+        return 141
+    except OSError as error:
+        _close_stdout()
+        what = f"{error.filename}: " if error.filename else "output "
+        return _fail(f"{what}cannot be read or written ({error.strerror or error})", 2)
+    except (MemoryError, RuntimeError) as error:
+        if isinstance(error, RuntimeError) and not any(text in str(error) for text in OUT_OF_MEMORY):
+            raise
+        line = (str(error).strip().splitlines() or ["MemoryError"])[0]
+        return _fail(f"there is not enough memory ({line}); use fewer views, pixels or channels", 2)
+    return code
+
+
+def _run(argv: list[str]) -> int:
     # torch's threads would go on spinning for a while after each operation, on the cores that kernels then wait for.
     os.environ.setdefault("OMP_WAIT_POLICY", "passive")
     if argv == ["--version"]:
@@ -31,32 +62,62 @@ def main(argv: Sequence[str] | None = None) -> int:
     try:
         import tyro
     except ImportError:
-        print("sgwarp: the command line needs tyro; run: pip install 'sgwarp[cli]'", file=sys.stderr)
-        return 2
+        return _fail("the command line needs tyro; run: pip install 'sgwarp[cli]'", 2)
     from sgwarp.commands import COMMANDS
 
     description = f"Open-vocabulary understanding of 3D Gaussian Splatting scenes, version {__version__}."
     command = tyro.extras.subcommand_cli_from_dict(dict(COMMANDS), prog="sgwarp", description=description, args=argv)
     command.command_line = shlex.join(["sgwarp", *argv])
-    try:
-        with _notices():
-            command.run()
-    except InputError as error:
-        print(f"sgwarp: {error}", file=sys.stderr)
-        return 2
-    except KeyboardInterrupt:
-        print("sgwarp: interrupted", file=sys.stderr)
-        return 130
+    with _notices():
+        command.run()
     return 0
+
+
+def _fail(message: str, code: int) -> int:
+    with suppress(OSError):
+        print(f"sgwarp: {printable(message)}", file=sys.stderr, flush=True)
+    return code
+
+
+def _write_any_text() -> None:
+    """Characters that the terminal's encoding lacks are written as escapes, instead of ending the run."""
+    for stream in (sys.stdout, sys.stderr):
+        if isinstance(stream, io.TextIOWrapper):
+            stream.reconfigure(errors="backslashreplace")
+
+
+def _flush_quietly() -> None:
+    try:
+        sys.stdout.flush()
+    except OSError:
+        _close_stdout()
+
+
+def _close_stdout() -> None:
+    """Send what is still buffered nowhere; the interpreter would try to write it when it ends."""
+    with suppress(OSError, ValueError):
+        sink = os.open(os.devnull, os.O_WRONLY)
+        os.dup2(sink, sys.stdout.fileno())
+        os.close(sink)
+
+
+class _Plain(logging.Formatter):
+    """Names of files in a notice come from others, as those in an error do."""
+
+    def format(self, record: logging.LogRecord) -> str:
+        return printable(super().format(record))
 
 
 @contextmanager
 def _notices() -> Iterator[None]:
     """Show on stderr what readers log, such as columns or photographs that they left out."""
     logger, handler = logging.getLogger("sgwarp"), logging.StreamHandler()
-    handler.setFormatter(logging.Formatter("sgwarp: %(message)s"))
+    handler.setFormatter(_Plain("sgwarp: %(message)s"))
+    level = logger.level
     logger.addHandler(handler)
+    logger.setLevel(logging.INFO)
     try:
         yield
     finally:
         logger.removeHandler(handler)
+        logger.setLevel(level)

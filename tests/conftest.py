@@ -28,6 +28,7 @@ def _load(name: str, path: Path):
 
 catalogue = _load("sgwarp_test_scenes", Path(__file__).with_name("scenes.py"))
 differences = _load("sgwarp_test_differences", Path(__file__).with_name("differences.py"))
+_pretended = _load("sgwarp_test_pretended", Path(__file__).with_name("pretended.py"))
 _stage = _load("sgwarp_test_stage", Path(__file__).with_name("stage.py"))
 stage, toy_text, stage_files = _stage.stage, _stage.toy_text, _stage.stage_files
 
@@ -62,6 +63,13 @@ def assert_central_differences():
     return differences.assert_central_differences
 
 
+@pytest.fixture
+def pretended_cuda():
+    """A CUDA device that is not there, for the length of the test (tests/pretended.py)."""
+    with _pretended.pretended_cuda() as device:
+        yield device
+
+
 @contextmanager
 def _allow_input_error(path: Path) -> Iterator[None]:
     try:
@@ -75,6 +83,23 @@ def _allow_input_error(path: Path) -> Iterator[None]:
 def allow_input_error():
     """Context manager for random input: either the block passes or an InputError names the file on one line."""
     return _allow_input_error
+
+
+@pytest.fixture
+def disk():
+    """`with disk(n):` a disk on which no file can grow beyond n bytes, as the operating system enforces it."""
+    resource = pytest.importorskip("resource")
+
+    @contextmanager
+    def limited(size: int) -> Iterator[None]:
+        soft, hard = resource.getrlimit(resource.RLIMIT_FSIZE)
+        resource.setrlimit(resource.RLIMIT_FSIZE, (size, hard))
+        try:
+            yield
+        finally:
+            resource.setrlimit(resource.RLIMIT_FSIZE, (soft, hard))
+
+    return limited
 
 
 @pytest.fixture(scope="session", autouse=True)

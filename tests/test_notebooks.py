@@ -13,6 +13,8 @@ import warp as wp
 from sgwarp.files.images import read_ids
 from sgwarp.ops import launcher  # noqa: F401 - starts Warp quietly
 
+pytestmark = pytest.mark.slow
+
 FOLDER = Path(__file__).resolve().parents[1] / "notebooks"
 NOTEBOOKS = sorted(FOLDER.glob("*.py"))
 

@@ -10,6 +10,8 @@ from pathlib import Path
 
 import pytest
 
+pytestmark = pytest.mark.slow
+
 ROOT = Path(__file__).resolve().parents[1]
 
 
@@ -100,3 +102,18 @@ def test_constraints_pin_every_requirement():
     assert wanted <= pinned
     assert all("==" in line for line in pins if line and not line.startswith("#"))
     assert "torch==2.13.0" in pins
+
+
+def test_the_lock_has_hashes_of_every_pin():
+    """`make lock` after constraints.txt has changed."""
+    sys.path.insert(0, str(ROOT))
+    try:
+        from tools.lock import LOCK, entries, normalized
+    finally:
+        sys.path.remove(str(ROOT))
+    known = entries(LOCK)
+    lines = (ROOT / "constraints.txt").read_text(encoding="utf-8").splitlines()
+    pins = {tuple(line.split(";")[0].strip().split("==")) for line in lines if line and not line.startswith("#")}
+    missing = [f"{name}=={version}" for name, version in pins if not known.get((normalized(name), version))]
+    assert not missing
+    assert len(pins) > 100

@@ -95,7 +95,8 @@ def _write_views(views: Sequence[View], labels: dict[str, NDArray[np.int32]], me
         write_rgb(out / name, view.image())
         write_ids(out / "labels" / f"{view.stem}.png", labels[view.stem].astype(np.uint8))
         frames.append({"file_path": name, "transform_matrix": poses[view.stem]})
-    _write_json(out / "transforms.json", {**meta, "frames": frames})
+    shipped = {key: value for key, value in meta.items() if key != "ply_file_path"}  # the points stay behind
+    _write_json(out / "transforms.json", {**shipped, "frames": frames})
 
 
 def _write_json(path: Path, content: Any) -> None:

@@ -10,13 +10,13 @@ from functools import cache
 import warp as wp
 
 from sgwarp.kernels.binning import TILE
+from sgwarp.kernels.blocks import power_of_two
 from sgwarp.kernels.gaussian import Splat
 from sgwarp.kernels.projection.forward import Knobs
-from sgwarp.kernels.transmittance import BLOCK_OPTIONS, LANES, Lanes, alpha_from_level, attenuated, contribution
+from sgwarp.kernels.transmittance import BLOCK_OPTIONS, LANES, Lanes, attenuated, contribution
 
 wp.set_module_options(BLOCK_OPTIONS)
 
-BLOCK = 256  # threads, one per pixel of a tile
 STAGE = 64  # splats staged at a time
 
 
@@ -32,7 +32,11 @@ def whitened(splat: Splat, x: int, y: int):
 def alpha_at(splat: Splat, x: int, y: int, knobs: Knobs) -> float:
     """Opacity of a splat at a pixel."""
     u, v = whitened(splat, x, y)
-    return alpha_from_level(splat.level - v * v - u * u, knobs)
+    level = splat.level - v * v - u * u
+    alpha = float(0.0)
+    if level >= knobs.alpha_min_level:
+        alpha = wp.min(power_of_two(level), knobs.alpha_max)
+    return alpha
 
 
 @cache
@@ -65,17 +69,17 @@ def pixel_walk(depth: bool, record: bool) -> wp.Function:
             ranks = wp.tile_load(listed, shape=STAGE, offset=start, storage="shared")
             staged = wp.tile_load_indexed(splats, indices=ranks, shape=(STAGE,), storage="shared")
             for j in range(wp.min(STAGE, stop - start)):
-                f = staged[j]
+                f = wp.tile_extract(staged, j)
                 alpha = alpha_at(f, x, y, knobs)
                 w = contribution(alpha, T, knobs)
-                color += w * f.color
-                if wp.static(record):
-                    latest = wp.where(w > 0.0, start - first + j, latest)
-                if wp.static(depth):
-                    depth_sum += w * f.depth
-                    behind = T - w
-                    if T > knobs.surface_transmittance and behind <= knobs.surface_transmittance:
-                        surface = start - first + j
+                if w > 0.0:  # colours that are not finite stay with the pixels they reach
+                    color += w * f.color
+                    if wp.static(record):
+                        latest = start - first + j
+                    if wp.static(depth):
+                        depth_sum += w * f.depth
+                        if T > knobs.surface_transmittance and T - w <= knobs.surface_transmittance:
+                            surface = start - first + j
                 T = attenuated(alpha, T, knobs)
             open_pixels = wp.tile_sum(wp.tile(wp.where(T > 0.0, 1, 0)))
             if open_pixels[0] == 0:
@@ -163,7 +167,7 @@ def feature_pixel_walk(record: bool) -> wp.Function:
             ranks = wp.tile_load(listed, shape=STAGE, offset=start, storage="shared")
             staged = wp.tile_load_indexed(splats, indices=ranks, shape=(STAGE,), storage="shared")
             for j in range(wp.min(STAGE, stop - start)):
-                f = staged[j]
+                f = wp.tile_extract(staged, j)
                 alpha = alpha_at(f, x, y, knobs)
                 w = contribution(alpha, T, knobs)
                 if w > 0.0:

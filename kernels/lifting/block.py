@@ -1,9 +1,13 @@
 """Feature lifting, block schedule (CUDA): 256 threads own a tile; weights and features meet in shared memory.
 
-For a batch of 16 fragments each thread computes the weight of its own pixel, then thread (fragment, channel)
-multiplies the 16 x 256 weights by the 256 x 16 features. Its sum goes to the Gaussian by one atomic addition per
-(tile, fragment, channel) or, in the ordered variant, to the row of its place in the lists; `shared.sum_rows` adds the
-rows up in a fixed order.
+For a batch of 16 fragments each thread puts the weight of its own pixel into shared memory. Dense maps are then a
+product of 16 x 256 weights with 256 x 32 features: thread (row of pixels, 4 fragments, 8 channels) keeps 32 sums in
+registers, twelve reads for 32 multiplications, and the sums of the 16 rows are added up in two steps. Id maps are sums
+of a row of pixels, which go to one id where the whole row shows it.
+
+A sum goes to the Gaussian by one atomic addition per (tile, fragment, channel) or, in the ordered variant, to the row
+of its place in the lists; `shared.sum_rows` adds the rows up in a fixed order. A block ends when all its pixels are
+closed. Shared memory is padded so that the threads of a warp meet no bank twice.
 """
 
 from functools import cache
@@ -11,14 +15,24 @@ from functools import cache
 import warp as wp
 
 from sgwarp.kernels.binning import TILE
-from sgwarp.kernels.compositing.block import BLOCK, alpha_at
+from sgwarp.kernels.blocks import BLOCK, barrier, put
+from sgwarp.kernels.compositing.block import alpha_at
 from sgwarp.kernels.gaussian import Splat
 from sgwarp.kernels.projection.forward import Knobs
-from sgwarp.kernels.transmittance import BLOCK_OPTIONS, LANES, Lanes, attenuated, contribution
+from sgwarp.kernels.transmittance import BLOCK_OPTIONS, LANES, attenuated, contribution
 
 wp.set_module_options(BLOCK_OPTIONS)
 
 BATCH = LANES  # fragments whose weights meet the features at a time
+CHANNELS = 2 * LANES  # that a block lifts
+FRAGMENTS = 4  # that a thread multiplies by
+EIGHT = 8  # channels
+Products = wp.types.vector(length=FRAGMENTS * EIGHT, dtype=wp.float32)
+WEIGHTS = BLOCK + 1  # floats between the weights of two fragments (dense)
+PIXELS = BLOCK + 4  # floats between two channels
+ROW_SUMS = BATCH * (CHANNELS + 1)  # floats between the sums of two rows of pixels
+PADDED_ROW = TILE + 1  # floats between two rows of weights (ids)
+FRAGMENT = TILE * PADDED_ROW
 
 
 @cache
@@ -31,63 +45,118 @@ def make_lift_dense_block(ordered: bool) -> wp.Kernel:
         offsets: wp.array[int],  # [tiles + 1]
         listed: wp.array[int],  # [I]
         splats: wp.array[Splat],  # [V]
-        features: wp.array3d[Lanes],  # [H, W, S] channels in slices of 16
+        features: wp.array3d[float],  # [H, W, 16 S] channels
         valid: wp.array2d[float],  # [H, W] 1 where the pixel carries semantics, else 0
-        first_feature: int,  # slice of `features` that this pass starts with
-        first_slice: int,  # slice of `sums_out` that this pass starts with (atomic variant)
+        first_feature: int,  # channel of `features` that this pass starts with
+        first_channel: int,  # of `sums_out` that this pass starts with (atomic variant)
+        channels: int,  # of this pass
         knobs: Knobs,
         width: int,
         height: int,
         # Out:
         sums_out: wp.array2d[float],  # [N, C] added to, or [I, C of this pass] by place
-        weights_out: wp.array[float],  # [N] added to, or [I] by place; written in the first slice of a pass
+        weights_out: wp.array[float],  # [N] added to, or [I] by place; written by the first blocks of a pass
     ):
-        """A^T f; one block per (tile, slice)."""
-        tile, s, t = wp.tid()
+        """A^T f; one block per (tile, 32 channels)."""
+        tile, part, t = wp.tid()
         columns = (width + TILE - 1) / TILE
-        x = (tile % columns) * TILE + t % TILE
-        y = (tile / columns) * TILE + t / TILE
-        inside = x < width and y < height
-        T = wp.where(inside, 1.0, 0.0)
+        x0 = (tile % columns) * TILE
+        y0 = (tile / columns) * TILE
+        x = x0 + t % TILE
+        y = y0 + t / TILE
+        T = float(0.0)
         seen = float(0.0)
-        values = Lanes(0.0)
-        if inside:
+        if x < width and y < height:
+            T = float(1.0)
             seen = valid[y, x]
-            values = features[y, x, first_feature + s]
-        pixels = wp.tile_zeros(shape=(LANES, BLOCK), dtype=float, storage="shared")
-        wp.tile_assign(pixels, wp.tile(values), offset=(0, 0))
-        shares = wp.tile_zeros(shape=(BATCH, BLOCK), dtype=float, storage="shared")
-        j = t / LANES
-        c = t % LANES
+        pixels = wp.tile_empty(shape=(wp.static(CHANNELS * PIXELS),), dtype=float, storage="shared")
+        for k in range(t, wp.static(CHANNELS * BLOCK), BLOCK):
+            c = k % CHANNELS
+            p = k / CHANNELS
+            value = float(0.0)
+            inside = x0 + p % TILE < width and y0 + p / TILE < height
+            if inside and CHANNELS * part + c < channels:
+                value = features[y0 + p / TILE, x0 + p % TILE, first_feature + CHANNELS * part + c]
+            put(pixels, PIXELS * c + p, value)
+        # Weights of a batch, then sums of rows of pixels.
+        shares = wp.tile_empty(shape=(wp.static(LANES // 2 * ROW_SUMS),), dtype=float, storage="shared")
+        totals = wp.tile_empty(shape=(wp.static(BATCH * PADDED_ROW),), dtype=float, storage="shared")
+        still_open = wp.tile_zeros(shape=(2,), dtype=float, storage="shared")
+        row = t / TILE
+        quad = FRAGMENTS * ((t % TILE) / 4)  # first of a thread's four fragments
+        c0 = t % 4  # first of its channels, of which every fourth is its own
+        first = offsets[tile]
         last = offsets[tile + 1]
-        for start in range(offsets[tile], last, BATCH):
-            count = wp.min(BATCH, last - start)
-            # The barriers of this load and of the assignment below keep readers and writers of `shares` apart.
+        stop = last  # where no pixel is open any more
+        for start in range(first, last, BATCH):
+            turn = ((start - first) / BATCH) % 2
+            size = wp.min(BATCH, last - start)
+            # The barriers of these loads keep readers of the last batch and writers of this one apart.
             ranks = wp.tile_load(listed, shape=BATCH, offset=start, storage="shared")
             staged = wp.tile_load_indexed(splats, indices=ranks, shape=(BATCH,), storage="shared")
-            weights = Lanes(0.0)
-            for b in range(BATCH):
-                if b < count:
-                    alpha = alpha_at(staged[b], x, y, knobs)
-                    weights[b] = contribution(alpha, T, knobs) * seen
-                    T = attenuated(alpha, T, knobs)
-            wp.tile_assign(shares, wp.tile(weights), offset=(0, 0))
-            if j < count:
-                total = float(0.0)
+            for b in range(size):
+                alpha = alpha_at(wp.tile_extract(staged, b), x, y, knobs)
+                put(shares, WEIGHTS * b + t, contribution(alpha, T, knobs) * seen)
+                T = attenuated(alpha, T, knobs)
+            if T > 0.0:
+                put(still_open, turn, 1.0)
+            barrier()
+            if t == 0:
+                put(still_open, 1 - turn, 0.0)
+            if part == 0:
                 weight = float(0.0)
-                for step in range(BLOCK):
-                    p = (step + c) % BLOCK  # start apart, so that 16 channels read 16 banks
-                    total += shares[j, p] * pixels[c, p]
-                    weight += shares[j, p]
-                gaussian = staged[j].gaussian
+                for i in range(TILE):
+                    weight += wp.tile_extract(shares, WEIGHTS * (t % TILE) + TILE * row + i)
+                put(totals, PADDED_ROW * (t % TILE) + row, weight)
+            products = Products(0.0)
+            for p in range(TILE * row, TILE * row + TILE):
+                for a in range(FRAGMENTS):
+                    w = wp.tile_extract(shares, WEIGHTS * (quad + a) + p)
+                    for e in range(EIGHT):
+                        value = wp.tile_extract(pixels, PIXELS * (4 * e + c0) + p)
+                        products[EIGHT * a + e] = products[EIGHT * a + e] + w * value
+            barrier()
+            mine = ROW_SUMS * (row % 8) + (CHANNELS + 1) * quad + c0
+            if row >= 8:
+                for a in range(FRAGMENTS):
+                    for e in range(EIGHT):
+                        put(shares, mine + (CHANNELS + 1) * a + 4 * e, products[EIGHT * a + e])
+            barrier()
+            if row < 8:
+                for a in range(FRAGMENTS):
+                    for e in range(EIGHT):
+                        place = mine + (CHANNELS + 1) * a + 4 * e
+                        put(shares, place, products[EIGHT * a + e] + wp.tile_extract(shares, place))
+            barrier()
+            for o in range(t, wp.static(CHANNELS * BATCH), BLOCK):
+                j = o / CHANNELS
+                c = o % CHANNELS
+                if j < size and CHANNELS * part + c < channels:
+                    total = float(0.0)
+                    for i in range(8):
+                        total += wp.tile_extract(shares, ROW_SUMS * i + (CHANNELS + 1) * j + c)
+                    if wp.static(ordered):
+                        sums_out[start + j, CHANNELS * part + c] = total
+                    else:
+                        gaussian = wp.tile_extract(staged, j).gaussian
+                        wp.atomic_add(sums_out, gaussian, first_channel + CHANNELS * part + c, total)
+            if part == 0 and t < size:
+                weight = float(0.0)
+                for i in range(TILE):
+                    weight += wp.tile_extract(totals, PADDED_ROW * t + i)
                 if wp.static(ordered):
-                    sums_out[start + j, s * LANES + c] = total
-                    if s == 0 and c == 0:
-                        weights_out[start + j] = weight
+                    weights_out[start + t] = weight
                 else:
-                    wp.atomic_add(sums_out, gaussian, (first_slice + s) * LANES + c, total)
-                    if s == 0 and c == 0:
-                        wp.atomic_add(weights_out, gaussian, weight)
+                    wp.atomic_add(weights_out, wp.tile_extract(staged, t).gaussian, weight)
+            if wp.tile_extract(still_open, turn) == 0.0:
+                stop = start + size
+                break
+        if wp.static(ordered):
+            for k in range(stop + t, last, BLOCK):
+                for c in range(CHANNELS * part, wp.min(CHANNELS * (part + 1), channels)):
+                    sums_out[k, c] = 0.0
+                if part == 0:
+                    weights_out[k] = 0.0
 
     return lift_dense_block
 
@@ -103,6 +172,7 @@ def make_lift_ids_block(ordered: bool) -> wp.Kernel:
         listed: wp.array[int],  # [I]
         splats: wp.array[Splat],  # [V]
         local_ids: wp.array3d[int],  # [tiles, 16, 16] place of each pixel's id in its tile's list, -1 = none
+        uniform: wp.array2d[int],  # [tiles, 16] the place all pixels of a row share, else -2
         tile_ids: wp.array2d[int],  # [tiles, 256]
         tile_id_counts: wp.array[int],  # [tiles]
         row_starts: wp.array[int],  # [tiles + 1] first weight of each tile
@@ -112,55 +182,93 @@ def make_lift_ids_block(ordered: bool) -> wp.Kernel:
         # Out:
         id_weights_out: wp.array2d[float],  # [N, M] added to (atomic variant)
         view_weights_out: wp.array[float],  # [N] added to (atomic variant)
-        weights_out: wp.array[float],  # for each place one weight per id of its tile (ordered variant)
+        weights_out: wp.array[float],  # for each place one weight per id of its tile, zeroed (ordered variant)
         starts_out: wp.array[int],  # [I] first weight of each place (ordered variant)
     ):
         """Sum of alpha T by id; one block per tile, 16 ids at a time."""
         tile, t = wp.tid()
         columns = (width + TILE - 1) / TILE
-        column = t % TILE
-        row = t / TILE
-        x = (tile % columns) * TILE + column
-        y = (tile / columns) * TILE + row
+        x = (tile % columns) * TILE + t % TILE
+        y = (tile / columns) * TILE + t / TILE
         T = wp.where(x < width and y < height, 1.0, 0.0)
-        place = local_ids[tile, row, column]
         ids = tile_id_counts[tile]
-        owners = wp.tile_zeros(shape=BLOCK, dtype=int, storage="shared")
-        wp.tile_assign(owners, wp.tile(place), offset=(0,))
-        shares = wp.tile_zeros(shape=(BATCH, BLOCK), dtype=float, storage="shared")
-        j = t / LANES
-        c = t % LANES
+        shares = wp.tile_empty(shape=(wp.static(BATCH * FRAGMENT),), dtype=float, storage="shared")
+        sums = wp.tile_empty(shape=(wp.static(LANES * (BLOCK + 1)),), dtype=float, storage="shared")
+        still_open = wp.tile_zeros(shape=(2,), dtype=float, storage="shared")
+        mine = PADDED_ROW * (t / TILE) + t % TILE  # place of this pixel among the weights of a fragment
+        j = t / TILE
+        c = t % TILE  # a row of pixels, and then an id
+        shared_id = uniform[tile, c]
         first = offsets[tile]
         last = offsets[tile + 1]
+        if wp.static(ordered):
+            for k in range(first + t, last, BLOCK):
+                starts_out[k] = row_starts[tile] + (k - first) * ids
         for start in range(first, last, BATCH):
-            count = wp.min(BATCH, last - start)
-            # The barriers of this load and of the assignment below keep readers and writers of `shares` apart.
+            turn = ((start - first) / BATCH) % 2
+            size = wp.min(BATCH, last - start)
+            # The barriers of these loads keep readers of the last batch and writers of this one apart.
             ranks = wp.tile_load(listed, shape=BATCH, offset=start, storage="shared")
             staged = wp.tile_load_indexed(splats, indices=ranks, shape=(BATCH,), storage="shared")
-            weights = Lanes(0.0)
-            for b in range(BATCH):
-                if b < count:
-                    alpha = alpha_at(staged[b], x, y, knobs)
-                    weights[b] = contribution(alpha, T, knobs)
-                    T = attenuated(alpha, T, knobs)
-            wp.tile_assign(shares, wp.tile(weights), offset=(0, 0))
-            if j < count:
-                gaussian = staged[j].gaussian
-                if wp.static(ordered) and c == 0:
-                    starts_out[start + j] = row_starts[tile] + (start + j - first) * ids
-                for m in range(c, ids, LANES):
+            for b in range(size):
+                alpha = alpha_at(wp.tile_extract(staged, b), x, y, knobs)
+                put(shares, FRAGMENT * b + mine, contribution(alpha, T, knobs))
+                T = attenuated(alpha, T, knobs)
+            if T > 0.0:
+                put(still_open, turn, 1.0)
+            barrier()
+            if t == 0:
+                put(still_open, 1 - turn, 0.0)
+            of_row = float(0.0)
+            if j < size:
+                for i in range(TILE):
+                    of_row += wp.tile_extract(shares, FRAGMENT * j + PADDED_ROW * c + i)
+            for chunk in range(0, ids, LANES):
+                count = wp.min(LANES, ids - chunk)
+                for m in range(count):
+                    total = wp.where(shared_id == chunk + m, of_row, 0.0)
+                    if shared_id == -2 and j < size and of_row > 0.0:
+                        for i in range(TILE):
+                            if local_ids[tile, c, i] == chunk + m:
+                                total += wp.tile_extract(shares, FRAGMENT * j + PADDED_ROW * c + i)
+                    put(sums, (BLOCK + 1) * m + t, total)
+                barrier()
+                if j < size and c < count:
                     total = float(0.0)
-                    for step in range(BLOCK):
-                        p = (step + c) % BLOCK
-                        if owners[p] == m:
-                            total += shares[j, p]
+                    for i in range(TILE):
+                        total += wp.tile_extract(sums, (BLOCK + 1) * c + TILE * j + i)
                     if wp.static(ordered):
-                        weights_out[row_starts[tile] + (start + j - first) * ids + m] = total
+                        weights_out[row_starts[tile] + (start + j - first) * ids + chunk + c] = total
                     elif total > 0.0:
-                        wp.atomic_add(id_weights_out, gaussian, tile_ids[tile, m], total)
+                        gaussian = wp.tile_extract(staged, j).gaussian
+                        wp.atomic_add(id_weights_out, gaussian, tile_ids[tile, chunk + c], total)
                         wp.atomic_add(view_weights_out, gaussian, total)
+                barrier()
+            if wp.tile_extract(still_open, turn) == 0.0:
+                break
 
     return lift_ids_block
+
+
+@wp.kernel
+def add_id_channels(
+    # In:
+    id_weights: wp.array2d[float],  # [N, M]
+    vectors: wp.array2d[float],  # [M, 16 S] one feature per id
+    # Out:
+    features_out: wp.array2d[float],  # [N, 16 S] added to
+):
+    """Multiply the id weights by the vectors, skipping zeros; 32 threads per Gaussian share its channels."""
+    thread = wp.tid()
+    i = thread / 32
+    for c in range(thread % 32, vectors.shape[1], 32):
+        total = float(0.0)
+        for m in range(id_weights.shape[1]):
+            w = id_weights[i, m]
+            if w > 0.0:
+                total += w * vectors[m, c]
+        if total != 0.0:
+            features_out[i, c] = features_out[i, c] + total
 
 
 @wp.kernel

@@ -83,6 +83,7 @@ def lift_ids(
     # In:
     base: int,
     slot: int,
+    chosen: wp.array[int],  # tiles to lift, or empty: all
     offsets: wp.array[int],  # [tiles + 1]
     listed: wp.array[int],  # [I]
     splats: wp.array[Splat],  # [V]
@@ -99,6 +100,8 @@ def lift_ids(
 ):
     """Sum of alpha T by id: the cost does not depend on the number of feature channels."""
     tile = base + wp.tid()
+    if chosen.shape[0] > 0:
+        tile = chosen[tile]
     columns = (width + TILE - 1) / TILE
     x0 = (tile % columns) * TILE
     y0 = (tile / columns) * TILE

@@ -18,6 +18,7 @@ MAX_IDS = wp.constant(256)  # a tile has 256 pixels, so no more ids
 def localize_ids(
     # In:
     base: int,  # first tile of this launch
+    chosen: wp.array[int],  # tiles to do, or empty: all
     ids: wp.array2d[int],  # [h, w] id map, -1 = none; may be smaller than the image
     width: int,  # of the image [pixels]
     height: int,
@@ -29,6 +30,8 @@ def localize_ids(
 ):
     """List the distinct ids of each tile, reading the map at the nearest position. One thread per tile."""
     tile = base + wp.tid()
+    if chosen.shape[0] > 0:
+        tile = chosen[tile]
     columns = (width + TILE - 1) / TILE
     x0 = (tile % columns) * TILE
     y0 = (tile / columns) * TILE

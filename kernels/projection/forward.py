@@ -151,3 +151,17 @@ def project_gaussians(
     splats_out[i] = splat
     depths_out[i] = point[2]
     status_out[i] = wp.uint8(VISIBLE)
+
+
+@wp.kernel
+def mark_non_finite_colors(
+    # In:
+    sh: wp.array2d[wp.vec3],  # [N, K]
+    # Out:
+    status_out: wp.array[wp.uint8],  # [N] NON_FINITE where a coefficient is, else as it was
+):
+    """Leave out Gaussians whose colour is not finite; a thread per coefficient, and all write the same."""
+    e = wp.tid()
+    i = e / sh.shape[1]
+    if not wp.isfinite(wp.dot(sh[i, e % sh.shape[1]], wp.vec3(0.0, 0.0, 0.0))):
+        status_out[i] = wp.uint8(NON_FINITE)

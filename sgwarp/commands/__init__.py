@@ -10,19 +10,23 @@ from sgwarp.commands.encoders import Encoders
 from sgwarp.commands.fit import Fit
 from sgwarp.commands.info import Info
 from sgwarp.commands.lift import Lift
+from sgwarp.commands.poses import Poses
 from sgwarp.commands.predict import Predict
 from sgwarp.commands.query import Query
 from sgwarp.commands.render import Render
 from sgwarp.commands.report import Report
 from sgwarp.commands.segment import Segment
+from sgwarp.commands.track import Track
 
 COMMANDS = {
+    "poses": Poses,
     "fit": Fit,
     "lift": Lift,
     "distill": Distill,
     "predict": Predict,
     "query": Query,
     "segment": Segment,
+    "track": Track,
     "render": Render,
     "info": Info,
     "convert": Convert,

@@ -6,7 +6,6 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from sgwarp.commands.options import Options, check_folder
-from sgwarp.errors import InputError
 
 
 @dataclass(kw_only=True)
@@ -18,9 +17,7 @@ class Demo(Options):
 
     def run(self) -> None:
         check_folder("--out", self.out)
-        if self.device != "cpu":
-            raise InputError(f"--device {self.device}: the demo runs on the CPU; use the other commands on CUDA")
         self.start()
         from sgwarp.demo.run import run_demo
 
-        run_demo(self.out)
+        run_demo(self.out, device=self.device)

@@ -1,7 +1,8 @@
-"""`sgwarp fit`: a scene from posed photographs."""
+"""`sgwarp fit`: a scene from photographs, with poses or without."""
 
 from __future__ import annotations
 
+import logging
 import math
 from dataclasses import asdict, dataclass
 from pathlib import Path
@@ -10,6 +11,7 @@ from typing import TYPE_CHECKING, Any, Literal
 import tyro
 
 from sgwarp.commands.options import Options, check_name, find_views
+from sgwarp.commands.poses import find_poses
 from sgwarp.errors import InputError
 from sgwarp.runs.progress import show_progress
 
@@ -20,20 +22,24 @@ if TYPE_CHECKING:
     from sgwarp.runs.log import RunLog
     from sgwarp.scene import View
 
+logger = logging.getLogger("sgwarp")
 DEGREE_EVERY = 1000  # steps between two rises of the degree of the colours
+LARGEST_GAP = 6.0  # between the quality of fitted and held-out photographs before it is warned of [dB]
 EVALUATE_EVERY = 500  # steps between two measurements, less in short runs
 
 
 @dataclass(kw_only=True)
 class Fit(Options):
-    """Fit Gaussians to posed photographs.
+    """Fit Gaussians to photographs.
 
+    A folder of photographs without poses, or a video, first goes through structure from motion (`sgwarp poses`), whose
+    COLMAP model is kept in OUT.sfm: give that folder as --views to other commands.
     Beside the scene go run.json (with the curve of quality over time), a contact sheet of the held-out views and, if
     matplotlib is installed, a plot. Ctrl-C stops after the step at hand and writes the scene as it is then.
     """
 
     views: tyro.conf.Positional[Path]
-    """Posed photographs: a folder with transforms.json or a COLMAP model."""
+    """Posed photographs (a folder with transforms.json or a COLMAP model), a folder of photographs, or a video."""
 
     out: Path
     """Scene to write, .ply (or .compressed.ply, quantised)."""
@@ -58,11 +64,16 @@ class Fit(Options):
     downscale: int = 1
     """Divide width and height of the photographs by this."""
 
+    max_size: int = 1600
+    """Photographs wider or higher than this are then scaled down to it [pixels]; 0 for none."""
+
     background: Literal["black", "white", "random"] = "black"
     """Behind the scene."""
 
-    init: Literal["auto", "points", "depth", "random"] = "auto"
-    """What to start from; auto: depth if --depth is given, else the data set's points if it has some, else random."""
+    init: Literal["auto", "points", "depth", "triangulated", "random"] = "auto"
+    """What to start from; auto: depth if --depth is given, else the data set's points if it has some, else points
+    triangulated with its poses (pycolmap), else random ones where the photographs agree. Few points are added to in
+    the same way."""
 
     points: Path | None = None
     """File of points to start from (.ply or COLMAP's points3D), if not the data set's own."""
@@ -89,6 +100,9 @@ class Fit(Options):
     seed: int = 0
     """Of everything random; on the CPU the same seed gives the same scene, bit by bit."""
 
+    images: str | None = None
+    """Name of a COLMAP model's folder of photographs, if it is not `images` nor the only one that holds them."""
+
     def run(self) -> None:
         from sgwarp.io.points import PLY_NAMES
 
@@ -102,7 +116,8 @@ class Fit(Options):
             from sgwarp.reconstruction.fitting.settings import FitSettings
             from sgwarp.reconstruction.fitting.trainer import fit
 
-            views = find_views(self.views)
+            source = self._posed(log)
+            views = find_views(source, images=self.images)
             held_out = views[:: self.hold_out] if self.hold_out else []
             kept = [view for index, view in enumerate(views) if not self.hold_out or index % self.hold_out]
             require_enough(kept)
@@ -119,7 +134,7 @@ class Fit(Options):
                 degree_every=min(DEGREE_EVERY, max(1, self.steps // (self.sh_degree + 1))),
             )
             masks = self._masks(views)
-            start = self._start(kept, settings, log)
+            start = self._start(source, kept, settings, log)
             checkpoint = self.out.with_name(f"{self.out.name}.checkpoint")
             with show_progress("fit") as progress:
                 fitted = fit(
@@ -128,6 +143,7 @@ class Fit(Options):
                     held_out,
                     settings,
                     downscale=self.downscale,
+                    largest=self.max_size,
                     masks=masks,
                     checkpoint=checkpoint,
                     checkpoint_every=self.checkpoint_every,
@@ -151,26 +167,78 @@ class Fit(Options):
             return masks_of_views(views)
         return None if str(self.masks) == "none" else masks_from_folder(self.masks, views)
 
-    def _start(self, views: list[View], settings: FitSettings, log: RunLog) -> Any:
-        """Points, a scene, or None for random points."""
-        from sgwarp.io.points import find_points, load_points
+    def _posed(self, log: RunLog) -> Path:
+        """The data set: what was given, or what structure from motion makes of it."""
+        from sgwarp.io.world import TRANSFORMS
 
-        init = self.init
-        if init == "auto":
-            own = self.points or find_points(self.views)
-            init = "depth" if self.depth is not None else "points" if own is not None else "random"
-        if init == "depth" and self.depth is None:
+        given = self.views
+        if not given.exists():
+            raise InputError(f"{given}: no such file or folder; check the path")
+        from sgwarp.io.colmap_model import find_model
+        from sgwarp.reconstruction.sfm.poses import photographs_in
+        from sgwarp.reconstruction.sfm.video import is_video
+
+        if not is_video(given):
+            posed = given.is_file() or any((given / name).is_file() for name in TRANSFORMS) or find_model(given)
+            if posed or not photographs_in(given):
+                return given
+        made = self.out.with_name(f"{self.out.name}.sfm")
+        logger.info("%s: holds no poses; they are found by structure from motion, and kept in %s", given, made)
+        find_poses(given, made, log, seed=self.seed)
+        log.outputs.append(str(made))
+        return made
+
+    def _start(self, source: Path, views: list[View], settings: FitSettings, log: RunLog) -> Any:
+        """Points, a scene, or None for random points."""
+        if self.init == "depth" and self.depth is None:
             raise InputError("--init depth: needs --depth, the folder of the depth images")
-        if self.resume or init == "random":  # a checkpoint holds the whole scene
+        if self.resume or self.init == "random":  # a checkpoint holds the whole scene
             return None
         with log.stage("start"):
-            if init == "points":
-                return load_points(self.points or self.views)
-            from sgwarp.reconstruction.depth import gaussians_from_depth
-            from sgwarp.reconstruction.fitting.initial import depth_from_folder
+            if self.init == "depth" or (self.init == "auto" and self.depth is not None):
+                from sgwarp.reconstruction.depth import gaussians_from_depth
+                from sgwarp.reconstruction.fitting.initial import depth_from_folder
 
-            assert self.depth is not None
-            return gaussians_from_depth(views, depth_from_folder(self.depth, views), count=settings.cap)
+                assert self.depth is not None
+                return gaussians_from_depth(views, depth_from_folder(self.depth, views), count=settings.cap)
+            if self.init in ("auto", "points") and (points := self._points(source)) is not None:
+                return points
+            return self._triangulated(views, log)
+
+    def _points(self, source: Path) -> Any:
+        """Those given or the data set's own; None if --init auto finds none."""
+        from sgwarp.io.points import find_points, load_points
+
+        if self.points is None and self.init == "auto":
+            try:
+                if find_points(source) is None:
+                    return None
+                return load_points(source)
+            except InputError as error:
+                logger.warning("%s", error)
+                return None
+        return load_points(self.points or source, source)
+
+    def _triangulated(self, views: list[View], log: RunLog) -> Any:
+        """Points of the poses, or None where --init auto cannot triangulate."""
+        from sgwarp.reconstruction.sfm.features import SfmSettings
+        from sgwarp.reconstruction.sfm.library import has_pycolmap
+        from sgwarp.reconstruction.sfm.triangulation import LEAST_POINTS, triangulate
+
+        if self.init == "auto" and not has_pycolmap():
+            logger.warning("start: no points, and pycolmap is not installed to triangulate some; starts at random")
+            return None
+        with show_progress("triangulate") as progress:
+            points = triangulate(views, SfmSettings(seed=self.seed, threads=log.threads), progress)
+        if len(points[0]) >= LEAST_POINTS:
+            logger.info("start: no points; %s were triangulated with the poses given", f"{len(points[0]):,}")
+            return points
+        if self.init == "triangulated":
+            raise InputError(
+                f"--init triangulated: only {len(points[0])} points fit the poses; are they right? Or use --init random"
+            )
+        logger.warning("start: no points, and only %d can be triangulated; starts at random", len(points[0]))
+        return None
 
     def _write(self, fitted: Fitted, held_out: list[View], masks: Masks | None, log: RunLog) -> None:
         from sgwarp.io.scenes import save_gaussians
@@ -183,15 +251,27 @@ class Fit(Options):
             log.outputs.append(str(self.out))
             if held_out:
                 sheet = self.out.with_name(f"{self.out.stem}.held_out.jpg")
-                photographs = read_photographs(held_out, downscale=self.downscale, masks=masks, device=self.device)
+                photographs = read_photographs(
+                    held_out, downscale=self.downscale, largest=self.max_size, masks=masks, device=self.device
+                )
                 write_contact_sheet(fitted.gaussians, photographs, sheet, white=self.background == "white")
                 log.outputs.append(str(sheet))
             if held_out and _has_matplotlib():
                 plot = self.out.with_name(f"{self.out.stem}.curve.png")
                 draw_curve(fitted.curve, plot)
                 log.outputs.append(str(plot))
-        if not math.isnan(last.psnr):
-            log.error["held_out_psnr"] = last.psnr
+        log.error["held_out_psnr"] = last.psnr
+        log.error["fitted_psnr"] = fitted.fitted_psnr
+        gap = fitted.fitted_psnr - last.psnr
+        if not math.isnan(gap):
+            log.error["overfitting_gap"] = gap
+        if gap > LARGEST_GAP:
+            logger.warning(
+                "overfitted: %.1f dB on the photographs that were fitted, %.1f dB on those held out; away from the "
+                "photographs the scene will look worse still. Take more photographs, from more places; start from "
+                "points; or use a smaller --cap",
+                *(fitted.fitted_psnr, last.psnr),
+            )
         log.error["loss"] = last.loss
         log.curve = [asdict(point) for point in fitted.curve]
 

@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from sgwarp.commands.options import SceneOptions
+from sgwarp.errors import InputError
 
 if TYPE_CHECKING:
     from sgwarp.scene import Gaussians
@@ -17,7 +18,10 @@ BINS = 10
 
 @dataclass(kw_only=True)
 class Info(SceneOptions):
-    """Print what a scene holds: count, bounds, harmonics, opacities, rows that cannot be rendered; its semantics."""
+    """Print what a scene holds: count, bounds, harmonics, opacities, rows that cannot be rendered; its semantics.
+
+    Of a moving scene (params.npz, a folder of .ply files): frames, identity of the Gaussians, and how much moves.
+    """
 
     semantics: Path | None = None
     """What `sgwarp lift` wrote for this scene."""
@@ -26,13 +30,33 @@ class Info(SceneOptions):
     """Print JSON instead of lines."""
 
     def run(self) -> None:
-        gaussians = self.load_scene(self.start())
+        log = self.start()
+        if self.scene.suffix == ".npz" or self.scene.is_dir():
+            self._show(self._sequence_facts())
+            return
+        gaussians = self.load_scene(log)
         from sgwarp.io.scenes import find_format
 
         form = find_format(self.scene)
         facts: dict[str, Any] = {"scene": str(self.scene), "format": form.name, **scene_facts(gaussians)}
         if self.semantics is not None:
             facts["semantics"] = semantics_facts(self.semantics, gaussians)
+        self._show(facts)
+
+    def _sequence_facts(self) -> dict[str, Any]:
+        """Frames, identity and motion of a moving scene.
+
+        Raises:
+            InputError: It cannot be read, or semantics are asked for, which belong to one scene.
+        """
+        from sgwarp.apps.tracking.facts import sequence_facts
+        from sgwarp.io.sequences import load_sequence
+
+        if self.semantics is not None:
+            raise InputError(f"--semantics: belong to one scene, {self.scene} is a sequence of them; leave it out")
+        return {"scene": str(self.scene), **sequence_facts(load_sequence(self.scene))}
+
+    def _show(self, facts: dict[str, Any]) -> None:
         print(json.dumps(facts, indent=2) if self.json else "\n".join(lines(facts)))
 
 

@@ -56,6 +56,9 @@ class Lift(SceneOptions):
     deterministic: bool = False
     """On CUDA, add up in a fixed order: slower, the same bits every time. The CPU always does."""
 
+    images: str | None = None
+    """Name of a COLMAP model's folder of photographs, if it is not `images` nor the only one that holds them."""
+
     def run(self) -> None:
         check_name("--out", self.out, ".safetensors")
         with self.logged(self.out.parent) as log:
@@ -71,7 +74,7 @@ class Lift(SceneOptions):
                 log.error["coverage"] = semantics.coverage
                 notes: dict[str, Any] = {"encoder": self.encoder}
             else:
-                views = find_views(self.views, photographs=self.photographs)
+                views = find_views(self.views, photographs=self.photographs, images=self.images)
                 with log.stage("compare"):
                     views = place_views(gaussians, self.scene, views, self.transform)
                 semantics = self._lift(gaussians, views, log)

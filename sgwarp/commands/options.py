@@ -24,8 +24,8 @@ if TYPE_CHECKING:
 
 @dataclass(kw_only=True)
 class Options:
-    device: Literal["cpu", "cuda"] = "cpu"
-    """Where to compute."""
+    device: str = "cpu"
+    """Where to compute: cpu, cuda (its current device) or cuda:N."""
 
     threads: int | None = None
     """Host threads on the CPU; all cores if not given."""
@@ -44,19 +44,21 @@ class Options:
         """Set the threads and the device.
 
         Raises:
-            InputError: There is no CUDA device, or the number of threads is not positive.
+            InputError: There is no such device, or the number of threads is not positive.
         """
         import torch
 
-        from sgwarp.ops.launcher import MAX_THREADS, get_threads, set_threads
+        from sgwarp.ops.launcher import MAX_THREADS, find_device, get_threads, set_threads
 
         if self.threads is not None:
             if not 1 <= self.threads <= MAX_THREADS:
                 raise InputError(f"--threads: expected 1 to {MAX_THREADS}, got {self.threads}")
             set_threads(self.threads)
             torch.set_num_threads(self.threads)
-        if self.device == "cuda" and not torch.cuda.is_available():
-            raise InputError("--device cuda: this machine or this torch has no CUDA device; use --device cpu")
+        try:
+            find_device(self.device)
+        except InputError as error:
+            raise InputError(f"--{error}") from None
         return RunLog(command=self.command_line, device=self.device, threads=get_threads())
 
 
@@ -156,15 +158,17 @@ def load_on(path: Path, gaussians: Gaussians) -> Semantics:
     return replace(semantics, **{name: getattr(semantics, name).to(gaussians.device) for name in names})
 
 
-def find_views(folder: Path, stem: str | None = None, photographs: bool = True) -> list[View]:
-    """All views of a folder, or the one named `stem`.
+def find_views(
+    folder: Path, stem: str | None = None, photographs: bool = True, images: str | None = None
+) -> list[View]:
+    """All views of a folder, or the one named `stem`; `images` names a COLMAP model's folder of photographs.
 
     Raises:
         InputError: The folder holds no views, or none of that name.
     """
     from sgwarp.io.views import load_views
 
-    views = load_views(folder, photographs=photographs)
+    views = load_views(folder, images, photographs)
     if stem is None:
         return views
     chosen = [view for view in views if view.stem == stem]

@@ -11,8 +11,7 @@ from sgwarp.commands.options import SemanticsOptions, check_name, find_views, ph
 from sgwarp.errors import InputError
 
 if TYPE_CHECKING:
-    from torch import Tensor
-
+    from sgwarp.querying.scoring import TextScores
     from sgwarp.runs.log import RunLog
     from sgwarp.scene import Semantics
 
@@ -49,6 +48,9 @@ class Query(SemanticsOptions):
     box: int = 9
     """Side of the box over which scores are averaged before the best pixel is taken [pixels]."""
 
+    images: str | None = None
+    """Name of a COLMAP model's folder of photographs, if it is not `images` nor the only one that holds them."""
+
     def run(self) -> None:
         check_name("--out", self.out, ".png")
         if not self.text.strip():
@@ -59,17 +61,18 @@ class Query(SemanticsOptions):
             raise InputError(f"--box: expected a side of 1 pixel or more, got {self.box}")
         with self.logged(self.out.parent) as log:
             from sgwarp.files.images import write_ids, write_rgb
-            from sgwarp.querying.ensembles import seen_by
             from sgwarp.querying.segmentation import localize
             from sgwarp.visualization.pictures import heat_map, mark_pixel
 
             gaussians, semantics = self.load_both(log)
             predicted = self.load_predicted(gaussians, log)
-            seen = seen_by(semantics, predicted, self.ensemble)
-            (view,) = place_views(gaussians, self.scene, find_views(self.views, self.view), self.transform)
+            views = find_views(self.views, self.view, images=self.images)
+            (view,) = place_views(gaussians, self.scene, views, self.transform)
             scores = self._scores(semantics, predicted, log)
             with log.stage("splat"):
-                (x, y), score_map = localize(scores, gaussians, view.camera, seen=seen, box=self.box)
+                (x, y), score_map = localize(
+                    scores.values[:, 0], gaussians, view.camera, seen=scores.seen, box=self.box
+                )
             mask = score_map > self.threshold
             print(f"{self.text}: best pixel ({x}, {y}), score {score_map[y, x]:.3f}; mask {mask.float().mean():.2%}")
             with log.stage("write"):
@@ -79,25 +82,20 @@ class Query(SemanticsOptions):
                 write_rgb(heat, mark_pixel(picture, (x, y)))
             log.outputs += [str(self.out), str(heat)]
 
-    def _scores(self, semantics: Semantics, predicted: Semantics | None, log: RunLog) -> Tensor:
-        """Score of every Gaussian on the scale of the mask, [N]."""
-        from sgwarp.querying.ensembles import combine, seen_by
-        from sgwarp.querying.scores import class_votes, evidence, query, relevancy, rescale
-        from sgwarp.scene.semantics import require_together
+    def _scores(self, semantics: Semantics, predicted: Semantics | None, log: RunLog) -> TextScores:
+        from sgwarp.querying.scoring import score_texts
 
-        if semantics.labels is not None:
-            return class_votes(semantics, [self.text], predicted=predicted, ensemble=self.ensemble)[:, 0]
-        with log.stage("load_encoder"):
-            encoder = self.text_encoder(semantics)
+        encoder = None
+        if semantics.labels is None:
+            with log.stage("load_encoder"):
+                encoder = self.text_encoder(semantics)
         with log.stage("query"):
-
-            def score(one: Semantics) -> Tensor:
-                if self.score == "cosine":
-                    return evidence(query(one, [self.text], encoder), one)
-                return evidence(relevancy(one, [self.text], encoder, self.canonical), one)
-
-            scores = score(semantics)
-            if predicted is not None:
-                require_together(semantics, predicted)
-                scores = combine(scores, score(predicted), (semantics.seen, predicted.seen), self.ensemble)
-            return rescale(scores, seen_by(semantics, predicted, self.ensemble))[:, 0]
+            return score_texts(
+                semantics,
+                [self.text],
+                encoder,
+                measure=self.score,
+                canonical=self.canonical,
+                predicted=predicted,
+                ensemble=self.ensemble,
+            )

@@ -49,6 +49,9 @@ class Render(SceneOptions):
     up: Literal["y-down", "y-up", "z-up", "z-down"] = "y-down"
     """Direction of the scene's axes, for the turn: y-down for most scenes from photographs."""
 
+    images: str | None = None
+    """Name of a COLMAP model's folder of photographs, if it is not `images` nor the only one that holds them."""
+
     def run(self) -> None:
         folder = self.out.parent if self.out.suffix == ".png" else self.out
         check_folder("--out", folder)
@@ -81,7 +84,7 @@ class Render(SceneOptions):
             views = find_views(self.views, self.view, photographs=False)
         except InputError:
             # A file that gives no image size needs the photographs after all; else this fails for the same reason.
-            views = find_views(self.views, self.view)
+            views = find_views(self.views, self.view, images=self.images)
         return self._placed(gaussians, views)
 
     def _placed(self, gaussians: Gaussians, views: list[View]) -> list[View]:
@@ -92,7 +95,7 @@ class Render(SceneOptions):
         assert self.views is not None
         try:
             with notices_held_back():  # those of the same views have been shown
-                compared = find_views(self.views, self.view)
+                compared = find_views(self.views, self.view, images=self.images)
         except InputError:
             compared = views
         matrix = find_placement(gaussians, self.scene, compared, self.transform)

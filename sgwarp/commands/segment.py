@@ -46,6 +46,9 @@ class Segment(SemanticsOptions):
     unknown_below: float = 0.0
     """Pixels whose best class has a smaller confidence are unknown, 0 to 1."""
 
+    images: str | None = None
+    """Name of a COLMAP model's folder of photographs, if it is not `images` nor the only one that holds them."""
+
     def run(self) -> None:
         check_folder("--out", self.out)
         if not 0.0 <= self.unknown_below <= 1.0:
@@ -58,7 +61,8 @@ class Segment(SemanticsOptions):
 
             gaussians, semantics = self.load_both(log)
             predicted = self.load_predicted(gaussians, log)
-            views = place_views(gaussians, self.scene, find_views(self.views, self.view), self.transform)
+            views = find_views(self.views, self.view, images=self.images)
+            views = place_views(gaussians, self.scene, views, self.transform)
             encoder = None
             if classes is not None and semantics.labels is None:
                 with log.stage("load_encoder"):
@@ -107,7 +111,7 @@ class Segment(SemanticsOptions):
         return [str(path), str(picture_path)]
 
 
-def class_names(text: str) -> list[str]:
+def class_names(text: str, option: str = "--classes") -> list[str]:
     """The names between the commas.
 
     Raises:
@@ -115,8 +119,8 @@ def class_names(text: str) -> list[str]:
     """
     names = [name.strip() for name in text.split(",")]
     if not all(names):
-        raise InputError(f"--classes {text!r}: name {names.index('') + 1} is empty")
+        raise InputError(f"{option} {text!r}: name {names.index('') + 1} is empty")
     twice = [name for name in names if names.count(name) > 1]
     if twice:
-        raise InputError(f"--classes {text!r}: '{twice[0]}' stands there twice")
+        raise InputError(f"{option} {text!r}: '{twice[0]}' stands there twice")
     return names

@@ -27,6 +27,7 @@ from sgwarp.ops.planar.projection import (
 )
 from sgwarp.ops.planar.splats import SplatJob, composite_splats
 from sgwarp.ops.splatting.settings import RasterSettings
+from sgwarp.runs.isolation import isolated
 
 NEAR = 0.2  # [m]
 ALPHA_MAX = 0.99
@@ -80,6 +81,7 @@ class GaussianRasterizer(torch.nn.Module):
             view = self.raster_settings.viewmatrix
             return positions @ view[:3, 2].to(positions) + view[3, 2].to(positions) > NEAR
 
+    @isolated
     def forward(
         self,
         means3D: Tensor,
@@ -211,6 +213,7 @@ class SparseGaussianAdam(torch.optim.Adam):
             parameter[rows] -= group["lr"] * first / (second.sqrt() + group["eps"])
 
 
+@isolated
 def dist2(points: Tensor) -> Tensor:
     """Mean of the squared distances to the three nearest other points, exact (`simple_knn.distCUDA2`).
 
@@ -290,7 +293,7 @@ def _intrinsics(settings: GaussianRasterizationSettings) -> Tensor:
     off_axis = max(abs(P[i, j].item()) for i, j in ((0, 1), (1, 0), (0, 3), (1, 3)))
     if not (w > 0 and off_axis < FOCAL_TOLERANCE * w):
         raise InputError("projmatrix: expected viewmatrix times a perspective projection, both transposed")
-    K = torch.eye(3, dtype=torch.float64)
+    K = torch.eye(3, dtype=torch.float64, device="cpu")
     sizes = (settings.image_width, settings.image_height)
     for axis, (size, tangent) in enumerate(zip(sizes, (settings.tanfovx, settings.tanfovy), strict=True)):
         slope = P[axis, axis].item() / w

@@ -2,15 +2,14 @@
 
 from __future__ import annotations
 
-import json
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
 
 import torch
 from torch import Tensor
 
-from sgwarp.files.access import read_bytes
+from sgwarp.files.documents import read_json
 from sgwarp.files.images import read_ids
 from sgwarp.io.scenes import load_gaussians
 from sgwarp.io.views import load_views
@@ -48,7 +47,7 @@ class Room:
         Raises:
             InputError: A file is missing or damaged.
         """
-        names = json.loads(read_bytes(folder / CLASSES_FILE))
+        names = read_json(folder / CLASSES_FILE)
         return cls(
             folder,
             load_gaussians(folder / SCENE_FILE),
@@ -56,6 +55,10 @@ class Room:
             load_views(folder / HELD_OUT),
             tuple(names[str(number)] for number in range(1, len(names))),
         )
+
+    def to(self, device: str) -> Room:
+        """The same room with its Gaussians there; photographs and labels stay on the CPU."""
+        return replace(self, gaussians=self.gaussians.to(device))
 
     @property
     def furniture(self) -> tuple[str, ...]:

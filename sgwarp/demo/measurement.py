@@ -11,12 +11,11 @@ from sgwarp.demo.data import FURNITURE, Room
 from sgwarp.encoders.base import TextEncoder
 from sgwarp.metrics.localization import hits_mask
 from sgwarp.metrics.segmentation import ConfusionMatrix
-from sgwarp.querying.scores import NONE_LEVEL, class_votes, evidence, query, rescale
-from sgwarp.querying.segmentation import localize, segment_votes, splat_scores
+from sgwarp.querying.scoring import TextScores, best_texts, score_texts
+from sgwarp.querying.segmentation import BOX, localize
 from sgwarp.scene import Semantics, View
 
 BACKGROUND = FURNITURE  # class of floor, wall and ceiling, for which nobody asks
-BOX = 9  # side of the box over which scores are averaged before the best pixel is taken [pixels]
 SMALLEST = 50  # an object with fewer pixels in a view is not looked for there
 
 
@@ -77,42 +76,32 @@ class Measurement:
 def measure(room: Room, semantics: Semantics, encoder: TextEncoder | None = None) -> Measurement:
     """Segment the held-out views and look for every piece of furniture in them.
 
-    A text is scored by the `evidence` of its cosines. What stays below NONE_LEVEL for all names is background.
+    Scores are those of `score_texts`, pixels those of `best_texts`; what shows none of the names is background.
 
     Args:
         room: The scene, views and truth.
         semantics: Lifted into it.
         encoder: Text encoder of the semantics' space; None for lifted labels.
     """
-    scores = (
-        class_votes(semantics, room.names)
-        if encoder is None
-        else evidence(query(semantics, room.furniture, encoder), semantics)
-    )
+    names = room.names if encoder is None else room.furniture
+    scores = score_texts(semantics, names, encoder)
     confusion = ConfusionMatrix.empty(FURNITURE + 1)
     classes = {}
     for view in room.held_out:
-        if encoder is None:
-            best, _ = segment_votes(room.gaussians, view.camera, scores, semantics.seen)
-            found = best >= 0
-        else:
-            mean, known = splat_scores(room.gaussians, view.camera, scores, semantics.seen)
-            height, best = mean.max(dim=2)
-            found = known & (height > NONE_LEVEL)
-        classes[view.stem] = torch.where(found, best.clamp(max=BACKGROUND), BACKGROUND)
+        best = best_texts(room.gaussians, view.camera, scores)
+        classes[view.stem] = torch.where(best >= 0, best.clamp(max=BACKGROUND), BACKGROUND).cpu()
         confusion.add(classes[view.stem], room.truth[view.stem].clamp(max=BACKGROUND))
     findings = []
-    if encoder is not None:  # the same order of pixels, on a scale that can be drawn
-        scores = rescale(scores, semantics.seen)
     for channel in range(FURNITURE):
         sizes = {view.stem: int((room.truth[view.stem] == channel).sum()) for view in room.held_out}
         shown = sorted(room.held_out, key=lambda view: -sizes[view.stem])
         sights = [view for view in shown if sizes[view.stem] >= SMALLEST]
-        findings += [_find(room, semantics, scores[:, channel], channel, view) for view in sights]
+        findings += [_find(room, scores, channel, view) for view in sights]
     return Measurement(confusion, classes, findings, semantics.coverage)
 
 
-def _find(room: Room, semantics: Semantics, scores: Tensor, channel: int, view: View) -> Finding:
-    pixel, score_map = localize(scores, room.gaussians, view.camera, seen=semantics.seen, box=BOX)
+def _find(room: Room, scores: TextScores, channel: int, view: View) -> Finding:
+    column = scores.values[:, channel]
+    pixel, score_map = localize(column, room.gaussians, view.camera, seen=scores.seen, box=BOX)
     hit = hits_mask(pixel, room.truth[view.stem] == channel)
-    return Finding(room.names[channel], view.stem, pixel, hit, score_map)
+    return Finding(room.names[channel], view.stem, pixel, hit, score_map.cpu())

@@ -41,7 +41,7 @@ PICTURES = {
 }
 
 
-def run_demo(out: Path, threads: int | None = None) -> RunLog:
+def run_demo(out: Path, threads: int | None = None, device: str = "cpu") -> RunLog:
     """Lift the default encoder's semantics into the room, ask for its furniture, measure, draw and report.
 
     Writes the PICTURES, report.md and run.json, and prints the report.
@@ -49,6 +49,7 @@ def run_demo(out: Path, threads: int | None = None) -> RunLog:
     Args:
         out: Folder to write into.
         threads: Host threads; all cores if None.
+        device: Where to compute.
 
     Returns:
         The log as written; its `error` holds `miou` (of the furniture), `localised` (of 11 objects), `coverage` and
@@ -68,25 +69,26 @@ def run_demo(out: Path, threads: int | None = None) -> RunLog:
     # layer, which on a busy machine takes longer than the layer.
     torch.set_num_threads(1)
     try:
-        return _run(out)
+        return _run(out, device)
     finally:
         set_threads(threads_before[0])
         torch.set_num_threads(threads_before[1])
 
 
-def _run(out: Path) -> RunLog:
-    log = RunLog(command="sgwarp demo", threads=get_threads())
+def _run(out: Path, device: str) -> RunLog:
+    log = RunLog(command="sgwarp demo", device=device, threads=get_threads())
     with log.stage("read"):
-        room = Room.load()
+        room = Room.load().to(device)
     with log.stage("load_encoder"):
-        source = make_encoder(ENCODER, room.views)
-        text = text_encoder_for(source.space)
+        source = make_encoder(ENCODER, room.views, device)
+        text = text_encoder_for(source.space, device=device)
         text.encode_text(room.furniture)
     maps = _encode(room, source, log)
     encode_seconds = log.stages["encode"] / len(room.views)
     with log.stage("compile"):
         _compile(room, maps, text)
-    trials = [_try(room, maps, encode_seconds, text, share, log if share == 1 else RunLog()) for share in SHARES]
+    logs = {share: log if share == 1 else RunLog(device=device) for share in SHARES}
+    trials = [_try(room, maps, encode_seconds, text, share, logs[share]) for share in SHARES]
     with log.stage("bound"):
         bound = _bound(room)
     for name, trial in (("", trials[-1]), ("_true_labels", bound)):
@@ -119,7 +121,8 @@ def _encode(room: Room, source: MapSource, log: RunLog) -> dict[str, FeatureMap]
 
 def _compile(room: Room, maps: dict[str, FeatureMap], text: TextEncoder) -> None:
     """Run the path on a part of the scene: Warp compiles every kernel at its first use, which is no part of a run."""
-    small = replace(room, gaussians=room.gaussians.subset(torch.arange(0, len(room.gaussians), SMALL)))
+    some = torch.arange(0, len(room.gaussians), SMALL, device=room.gaussians.device)
+    small = replace(room, gaussians=room.gaussians.subset(some))
     measure(small, lift(small.gaussians, room.views[:2], maps), text)
     rasterize(small.gaussians, room.views[0].camera, expected_depth=True)
 
@@ -154,7 +157,7 @@ def _draw(room: Room, trials: list[Trial], bound: Trial, out: Path) -> None:
     for view in room.held_out:
         seen = rasterize(room.gaussians, view.camera, expected_depth=True)
         assert seen.expected_depth is not None
-        renderings[view.stem] = seen.features, seen.expected_depth
+        renderings[view.stem] = seen.features.cpu(), seen.expected_depth.cpu()
     result = trials[-1].result
     columns = [(f"encoder {ENCODER}", result), ("true labels, lifted the same way", bound.result)]
     draw_renderings(room, renderings, out / "renderings.png")
@@ -164,9 +167,10 @@ def _draw(room: Room, trials: list[Trial], bound: Trial, out: Path) -> None:
 
 
 def _about(room: Room, log: RunLog) -> str:
+    device = "" if log.device == "cpu" else f"device: {log.device}, "
     return (
         f"{len(room.gaussians):,} Gaussians; {len(room.views)} photographs lifted with encoder {ENCODER}; measured on "
-        f"{len(room.held_out)} held-out views; host threads: {log.threads}. "
+        f"{len(room.held_out)} held-out views; {device}host threads: {log.threads}. "
         "mIoU is that of the furniture, accuracy that of all pixels; an object is found if the best pixel lies on it, "
         "in the held-out view that shows most of it."
     )

@@ -10,9 +10,12 @@ from __future__ import annotations
 
 import hashlib
 import json
+import logging
 import os
+import shutil
 import sys
 from collections.abc import Sequence
+from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
@@ -22,9 +25,10 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from sgwarp.encoders.base import MapSource, TextEncoder
-from sgwarp.encoders.maps.feature_files import load_archive
 from sgwarp.errors import InputError
-from sgwarp.files.atomic import atomic_path
+from sgwarp.files.arrays import read_arrays
+from sgwarp.files.atomic import TEMPORARY, atomic_path, remove_leftovers
+from sgwarp.files.documents import parse_json
 from sgwarp.scene import FeatureMap, View
 from sgwarp.version import __version__
 
@@ -72,6 +76,7 @@ class CachedMaps:
         self.folder = default_folder() if folder is None else Path(folder)
         self.space, self.needs_image = source.space, source.needs_image
         self.hits = 0
+        self._told = False
         try:
             self.folder.mkdir(parents=True, exist_ok=True)
         except OSError as error:
@@ -88,14 +93,16 @@ class CachedMaps:
         key = getattr(self.source, "cache_key", lambda view: None)(view)
         if key is None or image is None:
             return self.source.encode(view, image)
-        path = self.folder / f"{self._name(key, image)}{SUFFIX}"
-        stored = _read(path)
+        name = self._name(key, image)
+        path = self.folder / f"{name}{SUFFIX}"
+        stored = _read(path, name)
         if stored is None:
-            stored = pack(self.source.encode(view, image))
+            stored = pack(self.source.encode(view, image), name)
             self._write(path, stored)
         else:
             self.hits += 1
-            os.utime(path)
+            with suppress(OSError):  # another process may have removed it, or the folder is write protected
+                os.utime(path)
         return unpack(stored)
 
     def encode_text(self, texts: Sequence[str]) -> Tensor:
@@ -118,15 +125,28 @@ class CachedMaps:
     def _write(self, path: Path, stored: dict[str, NDArray[Any]]) -> None:
         # Ids compress a hundredfold; features hardly, and slowly.
         save = np.savez if "dense" in stored else np.savez_compressed
-        with atomic_path(path) as temporary:
-            save(temporary, **stored)  # type: ignore[arg-type]
-        shrink(self.folder, self.limit, keep=path)
+        try:
+            if path.is_dir():
+                shutil.rmtree(path)
+            with atomic_path(path, durable=False) as temporary:
+                save(temporary, **stored)  # type: ignore[arg-type]
+            shrink(self.folder, self.limit, keep=path)
+        except (InputError, OSError) as error:
+            if not self._told:  # what was encoded is not lost: the lift goes on without its cache
+                logging.getLogger("sgwarp").warning("cache %s: maps are not kept (%s)", self.folder, error)
+            self._told = True
 
 
 def shrink(folder: Path, limit: float, keep: Path | None = None) -> None:
-    """Remove the maps that were not used for longest until the rest is within `limit` gigabytes; `keep` stays."""
+    """Remove the maps that were not used for longest until the rest is within `limit` gigabytes; `keep` stays.
+
+    What killed processes left goes first, and what others are writing counts.
+    """
+    remove_leftovers(folder)
     entries = []
-    for path in folder.glob(f"*{SUFFIX}"):
+    for path in folder.iterdir():
+        if not path.name.endswith(SUFFIX) and not TEMPORARY.fullmatch(path.name):
+            continue
         try:
             facts = path.stat()
         except FileNotFoundError:  # somebody else shrinks too
@@ -136,14 +156,15 @@ def shrink(folder: Path, limit: float, keep: Path | None = None) -> None:
     for _, size, path in sorted(entries, key=lambda entry: entry[:2]):
         if total <= limit * GIGABYTE:
             return
-        if path != keep:
-            path.unlink(missing_ok=True)
-            total -= size
+        if path != keep and path.name.endswith(SUFFIX):
+            with suppress(OSError):
+                path.unlink(missing_ok=True)
+                total -= size
 
 
-def pack(found: FeatureMap) -> dict[str, NDArray[Any]]:
-    """A feature map as arrays to be stored."""
-    header = {"space": found.space, "labels": found.labels}
+def pack(found: FeatureMap, name: str = "") -> dict[str, NDArray[Any]]:
+    """A feature map as arrays to be stored, under the name that says what it was made from."""
+    header = {"space": found.space, "labels": found.labels, "name": name}
     arrays: dict[str, NDArray[Any]] = {"header": np.frombuffer(json.dumps(header).encode(), np.uint8)}
     if found.dense is not None:
         arrays["dense"] = _half(found.dense)
@@ -165,12 +186,19 @@ def unpack(stored: dict[str, NDArray[Any]]) -> FeatureMap:
     Raises:
         InputError, KeyError, ValueError: The arrays do not belong to one.
     """
-    header = json.loads(stored["header"].tobytes())
+    header = _header(stored)
     tensors = {name: torch.from_numpy(values) for name, values in stored.items() if name != "header"}
     if "ids" in tensors:
         tensors["ids"] = tensors["ids"].to(torch.int32)
     labels = header["labels"]
     return FeatureMap(header["space"], labels=None if labels is None else tuple(labels), **tensors)
+
+
+def _header(stored: dict[str, NDArray[Any]]) -> dict[str, Any]:
+    header = parse_json("header", stored["header"].tobytes())
+    if not isinstance(header, dict) or not isinstance(header.get("space"), str):
+        raise InputError("header: names no space")
+    return header
 
 
 def _half(values: Tensor) -> NDArray[Any]:
@@ -181,14 +209,17 @@ def _half(values: Tensor) -> NDArray[Any]:
     return kept.to(torch.float16 if fits else torch.float32).contiguous().numpy()
 
 
-def _read(path: Path) -> dict[str, NDArray[Any]] | None:
-    """Arrays of a stored map, or None if it is not there or damaged (every array has a checksum)."""
+def _read(path: Path, name: str) -> dict[str, NDArray[Any]] | None:
+    """Arrays of a stored map, or None if it is not there, damaged (every array has a checksum) or another one's."""
     if not path.is_file():
         return None
     try:
-        stored = load_archive(path)
+        stored = read_arrays(path)
         unpack(stored)
-    except (InputError, KeyError, ValueError, TypeError):
+        if _header(stored).get("name") == name:
+            return stored
+    except (InputError, KeyError, ValueError, TypeError, RuntimeError):
+        pass
+    with suppress(OSError):
         path.unlink(missing_ok=True)
-        return None
-    return stored
+    return None

@@ -29,6 +29,8 @@ class Kind:
         argument: What follows the colon, "" for nothing.
         example: A whole name to give to --encoder.
         extra: What has to be installed.
+        make: Its builder as "module:function", in the folder of its role; see `building`.
+        speak: The builder of its text side, "" if it has none.
         options: Name and type of what may follow the question mark.
     """
 
@@ -39,6 +41,8 @@ class Kind:
     example: str
     extra: str = ""
     options: dict[str, str] = field(default_factory=dict)
+    make: str = field(kw_only=True)
+    speak: str = field(default="", kw_only=True)
 
     @property
     def missing(self) -> list[str]:
@@ -67,6 +71,8 @@ KINDS = (
         "conse",
         "conse",
         {**TEMPLATES},
+        make="sgwarp.encoders.images.conse.encoder:make_source",
+        speak="sgwarp.encoders.images.conse.text:make_text",
     ),
     Kind(
         "clip",
@@ -76,6 +82,8 @@ KINDS = (
         "clip:openai/clip-vit-base-patch16+sam:facebook/sam-vit-huge",
         "models",
         {**TEMPLATES, **SEEN, "rule": "text"},
+        make="sgwarp.encoders.images.clip:make_source",
+        speak="sgwarp.encoders.images.clip:make_text",
     ),
     Kind(
         "siglip",
@@ -85,6 +93,8 @@ KINDS = (
         "siglip:google/siglip-base-patch16-224+sam2:facebook/sam2.1-hiera-small",
         "models",
         {**TEMPLATES, **SEEN, "rule": "text"},
+        make="sgwarp.encoders.images.clip:make_source",
+        speak="sgwarp.encoders.images.clip:make_text",
     ),
     Kind(
         "siglip2",
@@ -94,6 +104,8 @@ KINDS = (
         "siglip2:google/siglip2-base-patch16-naflex+graph",
         "models",
         {**TEMPLATES, **SEEN, "rule": "text"},
+        make="sgwarp.encoders.images.clip:make_source",
+        speak="sgwarp.encoders.images.clip:make_text",
     ),
     Kind(
         "lseg",
@@ -103,6 +115,8 @@ KINDS = (
         "lseg:demo_e200.ckpt+sam:facebook/sam-vit-huge",
         "models",
         {**TEMPLATES, **SEEN, "tokenizer": "text"},
+        make="sgwarp.encoders.pixels.lseg:make_source",
+        speak="sgwarp.encoders.pixels.lseg:make_text",
     ),
     Kind(
         "openseg",
@@ -112,6 +126,7 @@ KINDS = (
         "openseg:openseg_exported_clip+text:clip:openai/clip-vit-large-patch14-336",
         "openseg",
         {"pooled": "switch"},
+        make="sgwarp.encoders.pixels.openseg:make_source",
     ),
     Kind(
         "clipseg",
@@ -121,6 +136,7 @@ KINDS = (
         "clipseg:CIDAS/clipseg-rd64-refined?classes=couch,lamp",
         "models",
         {**TEMPLATES, "classes": "list"},
+        make="sgwarp.encoders.pixels.clipseg:make_source",
     ),
     Kind(
         "gdino",
@@ -130,6 +146,7 @@ KINDS = (
         "gdino:IDEA-Research/grounding-dino-tiny?classes=couch,lamp+sam:facebook/sam-vit-base+text:conse",
         "models",
         {**DETECTOR},
+        make="sgwarp.encoders.instances.grounding_dino:make_source",
     ),
     Kind(
         "owlv2",
@@ -139,6 +156,7 @@ KINDS = (
         "owlv2:google/owlv2-base-patch16-ensemble?classes=couch,lamp+sam2:facebook/sam2.1-hiera-small+text:conse",
         "models",
         {**DETECTOR, **TEMPLATES},
+        make="sgwarp.encoders.instances.owlv2:make_source",
     ),
     Kind(
         "vlpart",
@@ -148,6 +166,7 @@ KINDS = (
         "vlpart:parts+text:conse",
         "",
         {"least_score": "float"},
+        make="sgwarp.encoders.instances.vlpart:make_source",
     ),
     Kind(
         "mask2former",
@@ -157,6 +176,7 @@ KINDS = (
         "mask2former:facebook/mask2former-swin-tiny-coco-panoptic",
         "models",
         {"least": "float", **SEEN},
+        make="sgwarp.encoders.maps.closed_set:make_source",
     ),
     Kind(
         "oneformer",
@@ -166,6 +186,7 @@ KINDS = (
         "oneformer:shi-labs/oneformer_coco_swin_large",
         "models",
         {"least": "float", **SEEN},
+        make="sgwarp.encoders.maps.closed_set:make_source",
     ),
     Kind(
         "files",
@@ -175,6 +196,7 @@ KINDS = (
         "files:features?layout=chw",
         "",
         {"layout": "text", "levels": "text", "straight": "text"},
+        make="sgwarp.encoders.maps.files:make_source",
     ),
     Kind(
         "openscene",
@@ -184,18 +206,98 @@ KINDS = (
         "openscene:scene_0.pt",
         "",
         {"space": "text"},
+        make="sgwarp.encoders.maps.openscene:make_source",
     ),
-    Kind("deva", "maps", "DEVA's ids of a whole video", "DIR", "deva:deva_out", "", {"least_score": "float"}),
-    Kind("sam", "masks", "Segment Anything", "PATH", "clip:PATH+sam:facebook/sam-vit-huge", "models", SAM_OPTIONS),
-    Kind("sam2", "masks", "SAM 2", "PATH", "clip:PATH+sam2:facebook/sam2.1-hiera-large", "models", SAM_OPTIONS),
-    Kind("sam3", "masks", "SAM 3", "PATH", "clip:PATH+sam3:facebook/sam3", "models", SAM_OPTIONS),
-    Kind("masks", "masks", "masks from files: label images or stacks", "DIR", "conse+masks:labels", "", RULE),
     Kind(
-        "graph", "masks", "graph segmentation, by OpenCV", "", "conse+graph?scales=100,300,900&levels=s,m,l", "", SCALES
+        "deva",
+        "maps",
+        "DEVA's ids of a whole video",
+        "DIR",
+        "deva:deva_out",
+        "",
+        {"least_score": "float"},
+        make="sgwarp.encoders.maps.deva:make_source",
     ),
-    Kind("slic", "masks", "SLIC superpixels, by OpenCV", "", "conse+slic?scales=24", "", SCALES),
-    Kind("seeds", "masks", "SEEDS superpixels, by OpenCV", "", "conse+seeds?scales=24", "", SCALES),
-    Kind("selective", "masks", "selective search, by OpenCV", "", "conse+selective?scales=24", "", SCALES),
+    Kind(
+        "sam",
+        "masks",
+        "Segment Anything",
+        "PATH",
+        "clip:PATH+sam:facebook/sam-vit-huge",
+        "models",
+        SAM_OPTIONS,
+        make="sgwarp.encoders.masks.sam:make_masks",
+    ),
+    Kind(
+        "sam2",
+        "masks",
+        "SAM 2",
+        "PATH",
+        "clip:PATH+sam2:facebook/sam2.1-hiera-large",
+        "models",
+        SAM_OPTIONS,
+        make="sgwarp.encoders.masks.sam:make_masks",
+    ),
+    Kind(
+        "sam3",
+        "masks",
+        "SAM 3",
+        "PATH",
+        "clip:PATH+sam3:facebook/sam3",
+        "models",
+        SAM_OPTIONS,
+        make="sgwarp.encoders.masks.sam:make_masks",
+    ),
+    Kind(
+        "masks",
+        "masks",
+        "masks from files: label images or stacks",
+        "DIR",
+        "conse+masks:labels",
+        "",
+        RULE,
+        make="sgwarp.encoders.masks.files:make_masks",
+    ),
+    Kind(
+        "graph",
+        "masks",
+        "graph segmentation, by OpenCV",
+        "",
+        "conse+graph?scales=100,300,900&levels=s,m,l",
+        "",
+        SCALES,
+        make="sgwarp.encoders.masks.proposals:make_masks",
+    ),
+    Kind(
+        "slic",
+        "masks",
+        "SLIC superpixels, by OpenCV",
+        "",
+        "conse+slic?scales=24",
+        "",
+        SCALES,
+        make="sgwarp.encoders.masks.proposals:make_masks",
+    ),
+    Kind(
+        "seeds",
+        "masks",
+        "SEEDS superpixels, by OpenCV",
+        "",
+        "conse+seeds?scales=24",
+        "",
+        SCALES,
+        make="sgwarp.encoders.masks.proposals:make_masks",
+    ),
+    Kind(
+        "selective",
+        "masks",
+        "selective search, by OpenCV",
+        "",
+        "conse+selective?scales=24",
+        "",
+        SCALES,
+        make="sgwarp.encoders.masks.proposals:make_masks",
+    ),
 )
 BY_NAME = {kind.name: kind for kind in KINDS}
 TEXT = "text"  # the part +text:NAME names the text side of another

@@ -5,7 +5,6 @@ from __future__ import annotations
 import os
 import struct
 import zlib
-from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -13,14 +12,19 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sgwarp.errors import InputError
-from sgwarp.files.access import read_bytes, reading
+from sgwarp.files.access import open_input, read_bytes
 from sgwarp.files.atomic import atomic_path
+from sgwarp.files.image_headers import (
+    JPEG_SIGNATURE,
+    PNG_SIGNATURE,
+    START_OF_SCAN,
+    check_image,
+    image_size,
+    jpeg_segments,
+    plain_png,
+    png_chunks,
+)
 
-PNG_SIGNATURE = b"\x89PNG\r\n\x1a\n"
-PNG_END = b"IEND\xaeB`\x82"
-JPEG_SIGNATURE = b"\xff\xd8\xff"
-START_OF_SCAN = 0xDA
-START_OF_FRAME = frozenset(range(0xC0, 0xD0)) - {0xC4, 0xC8, 0xCC}  # baseline, progressive, ...
 HEADER_BYTES = 1 << 18
 ALPHA_SUFFIXES = (".png", ".webp", ".tif", ".tiff")
 RGB_SUFFIXES = (".png", ".jpg", ".jpeg")
@@ -64,16 +68,11 @@ def read_size(path: str | os.PathLike[str]) -> tuple[int, int]:
     Raises:
         InputError: The file is missing or not an image.
     """
-    with reading(path), open(path, "rb") as file:
+    with open_input(path) as file:
         head = file.read(HEADER_BYTES)
-    if head.startswith(PNG_SIGNATURE) and len(head) >= 24:
-        width, height = struct.unpack_from(">II", head, 16)
-        return height, width
-    if head.startswith(JPEG_SIGNATURE):
-        for marker, position in _jpeg_segments(head):
-            if marker in START_OF_FRAME and position + 5 <= len(head):
-                height, width = struct.unpack_from(">HH", head, position + 1)
-                return height, width
+    size = image_size(head) if head.startswith((PNG_SIGNATURE, JPEG_SIGNATURE)) else None
+    if size is not None:
+        return size
     height, width = read_rgb(path).shape[:2]
     return height, width
 
@@ -162,8 +161,11 @@ def write_ids(path: str | os.PathLike[str], ids: Any) -> None:
 def _decode(path: str | os.PathLike[str], data: bytes, flags: int) -> NDArray[Any]:
     import cv2
 
+    check_image(path, data)
     if _cut_short(data):
         raise InputError(f"{path}: image is cut short ({len(data)} bytes); copy or download it again")
+    if data.startswith(PNG_SIGNATURE):
+        data = plain_png(data)  # the decoder takes memory for what other chunks claim
     try:
         pixels = cv2.imdecode(np.frombuffer(data, np.uint8), flags)
     except cv2.error:
@@ -174,28 +176,12 @@ def _decode(path: str | os.PathLike[str], data: bytes, flags: int) -> NDArray[An
 
 
 def _cut_short(data: bytes) -> bool:
-    """Whether a PNG or JPEG lacks its end marker; OpenCV fills the missing part of a JPEG with grey."""
-    if data.startswith(PNG_SIGNATURE):
-        return PNG_END not in data
+    """Whether a JPEG lacks its end marker; OpenCV fills the missing part with grey."""
     if not data.startswith(JPEG_SIGNATURE):
-        return len(data) == 0
+        return False
     # An embedded thumbnail has an end marker of its own, so the search starts at the image data.
-    scans = (position for marker, position in _jpeg_segments(data) if marker == START_OF_SCAN)
+    scans = (position for marker, position in jpeg_segments(data) if marker == START_OF_SCAN)
     return data.find(b"\xff\xd9", next(scans, len(data))) < 0
-
-
-def _jpeg_segments(data: bytes) -> Iterator[tuple[int, int]]:
-    """Marker and position of the content of each segment up to the image data (ITU T.81, annex B)."""
-    position = 2
-    while position + 4 <= len(data) and data[position] == 0xFF:
-        marker = data[position + 1]
-        if marker == 0xFF:  # padding
-            position += 1
-            continue
-        yield marker, position + 4
-        if marker == START_OF_SCAN:
-            return
-        position += 2 + int.from_bytes(data[position + 2 : position + 4], "big")
 
 
 def _palette_as_grey(data: bytes) -> bytes:
@@ -205,16 +191,13 @@ def _palette_as_grey(data: bytes) -> bytes:
     in the header and the palette's own chunks tell them apart.
     """
     chunks = [PNG_SIGNATURE]
-    position = len(PNG_SIGNATURE)
-    while position + 12 <= len(data):
-        length, kind = struct.unpack_from(">I4s", data, position)
-        chunk = data[position : position + 12 + length]
+    for kind, at, length in png_chunks(data):
+        chunk = data[at - 8 : at + length + 4]
         if kind == b"IHDR":
-            body = kind + data[position + 8 : position + 17] + b"\x00" + data[position + 18 : position + 21]
+            body = kind + data[at : at + 9] + b"\x00" + data[at + 10 : at + 13]
             chunk = struct.pack(">I", 13) + body + struct.pack(">I", zlib.crc32(body))
         if kind not in (b"PLTE", b"tRNS", b"bKGD", b"hIST", b"sBIT"):
             chunks.append(chunk)
-        position += 12 + length
     return b"".join(chunks)
 
 

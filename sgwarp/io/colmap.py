@@ -14,6 +14,8 @@ from sgwarp.errors import InputError
 from sgwarp.files.exif import UPRIGHT
 from sgwarp.io.colmap_model import ImageRecord, count_images, find_model, find_models, read_cameras, read_images
 from sgwarp.io.colmap_model import read_points as read_points
+from sgwarp.io.image_folders import find_image_folder
+from sgwarp.io.names import inside
 from sgwarp.io.photographs import LeftOut, fit_photograph, say_orientations
 from sgwarp.io.stems import unique_stems
 from sgwarp.io.undistort import Lens, Listed, pinhole_view
@@ -22,7 +24,7 @@ from sgwarp.scene import View
 MISSING, UNPOSED = "without photograph", "whose pose holds NaN or infinity"
 
 
-def read_colmap(path: str | os.PathLike[str], image_folder: str = "images", photographs: bool = True) -> list[View]:
+def read_colmap(path: str | os.PathLike[str], image_folder: str | None = None, photographs: bool = True) -> list[View]:
     """Read the registered images of a COLMAP reconstruction, sorted by name.
 
     Distorted photographs are undistorted when read (`View.undistort`), and the camera is that of the undistorted
@@ -33,7 +35,8 @@ def read_colmap(path: str | os.PathLike[str], image_folder: str = "images", phot
 
     Args:
         path: The data set (with sparse/0, sparse or colmap/sparse/0) or the folder of the model itself.
-        image_folder: Name of the folder of photographs; looked for beside the model and up to two levels above.
+        image_folder: Name or path of the folder of photographs, looked for beside the model and up to three levels
+            above; if None, `images`, or else the only folder that holds them.
         photographs: False to take the cameras alone; then no photograph is looked for.
 
     Raises:
@@ -45,13 +48,13 @@ def read_colmap(path: str | os.PathLike[str], image_folder: str = "images", phot
         raise InputError(f"{path}: holds no COLMAP model (cameras.bin or cameras.txt in sparse/0, sparse or itself)")
     _say_models(path, model)
     lenses = read_cameras(model)
-    folder = _find_images(model, image_folder) if photographs else None
     records = read_images(model)
+    folder = find_image_folder(model, [record.name for record in records], image_folder) if photographs else None
     left_out = LeftOut(model, "images")
     kept = [record for record in records if _usable(record, lenses, folder, left_out)]
     views, used = [], []
     for stem, record in zip(unique_stems(model, [record.name for record in kept]), kept, strict=True):
-        image = folder / record.name if folder is not None else None
+        image = inside(model, folder, record.name) if folder is not None else None
         lens, pose, orientation = lenses[record.camera_id], _world_to_camera(record), UPRIGHT
         assert isinstance(lens, Lens)
         assert pose is not None
@@ -80,14 +83,14 @@ def _usable(record: ImageRecord, lenses: dict[int, Lens | InputError], folder: P
     """Whether an image has a camera, a pose and a photograph; if not, why is noted.
 
     Raises:
-        InputError: It refers to a camera that is not listed: the files do not belong together.
+        InputError: It refers to a camera that is not listed, or to a file outside the folder of photographs.
     """
     if record.camera_id not in lenses:
         raise InputError(
             f"{left_out.source}: image {record.name!r} refers to camera {record.camera_id}, which is not listed"
         )
     lens = lenses[record.camera_id]
-    if folder is not None and not os.path.isfile(folder / record.name):
+    if folder is not None and not os.path.isfile(inside(left_out.source, folder, record.name)):
         left_out.add(MISSING, record.name)
     elif _world_to_camera(record) is None:
         left_out.add(UNPOSED, record.name)
@@ -105,21 +108,8 @@ def _say_models(path: Path, model: Path) -> None:
         sizes = ", ".join(f"{other.name} with {count_images(other)}" for other in models)
         logging.getLogger("sgwarp").warning(
             "%s: holds %d models (%s images); the one with most images is read, %s",
-            path,
-            len(models),
-            sizes,
-            model.name,
+            *(path, len(models), sizes, model.name),
         )
-
-
-def _find_images(model: Path, name: str) -> Path:
-    above = (model, *list(model.resolve().parents)[:3])
-    for folder in above:
-        if (folder / name).is_dir():
-            return folder / name
-    raise InputError(
-        f"{model}: no folder '{name}' of photographs beside the model or up to {above[-1]}; name it with image_folder"
-    )
 
 
 def _world_to_camera(record: ImageRecord) -> NDArray[np.float64] | None:

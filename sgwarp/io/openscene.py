@@ -8,13 +8,12 @@ The N points are the scene's Gaussians, in their order. Nothing is lifted: these
 from __future__ import annotations
 
 import os
-import pickle
 
 import torch
 from torch import Tensor
 
 from sgwarp.errors import InputError
-from sgwarp.files.access import reading
+from sgwarp.files.torch_files import load_torch
 from sgwarp.scene import Gaussians, Semantics
 
 
@@ -32,16 +31,13 @@ def load_openscene(path: str | os.PathLike[str], gaussians: Gaussians, space: st
     Raises:
         InputError: The file is missing, damaged, or was made for another number of points.
     """
-    with reading(path):
-        try:
-            content = torch.load(path, map_location="cpu", weights_only=True)
-            features, mask = content["feat"], content["mask_full"]
-        except (RuntimeError, EOFError, ValueError, KeyError, TypeError, pickle.UnpicklingError) as error:
-            line = (str(error).splitlines() or [type(error).__name__])[0]
-            raise InputError(f"{path}: is no .pt with feat and mask_full, or is damaged ({line})") from None
+    content = load_torch(path)
+    if not isinstance(content, dict) or not {"feat", "mask_full"} <= set(content):
+        raise InputError(f"{path}: is no .pt with feat and mask_full")
+    features, mask = content["feat"], content["mask_full"]
     if not isinstance(features, Tensor) or not isinstance(mask, Tensor) or mask.dtype != torch.bool:
         raise InputError(f"{path}: expected tensors feat [M, C] and mask_full, bool [N]")
-    if features.ndim != 2 or mask.ndim != 1 or len(features) != int(mask.sum()):
+    if features.ndim != 2 or not features.is_floating_point() or mask.ndim != 1 or len(features) != int(mask.sum()):
         shapes = f"feat {list(features.shape)}, mask_full {list(mask.shape)} with {int(mask.sum())} set"
         raise InputError(f"{path}: expected one row of feat for each point that mask_full sets, got {shapes}")
     if len(mask) != len(gaussians):

@@ -21,6 +21,7 @@ from sgwarp.files.access import reading
 from sgwarp.files.atomic import atomic_path
 from sgwarp.io.colors import rgb_names, unit_colors
 from sgwarp.io.formats.foreign import describe_ply
+from sgwarp.io.ply_header import check_ply
 from sgwarp.scene import SH_COUNTS, Gaussians
 
 Elements = Mapping[str, NDArray[Any]]  # element name -> structured array, one field per property
@@ -47,8 +48,8 @@ def read_elements(path: str | os.PathLike[str]) -> Elements:
     Raises:
         InputError: The file is missing, not a PLY file, or cut short.
     """
-    import plyfile
-
+    plyfile = _plyfile(path)
+    check_ply(path)
     try:
         with reading(path), np.errstate(over="ignore"):
             content = plyfile.PlyData.read(os.fspath(path))
@@ -73,12 +74,19 @@ def read_elements(path: str | os.PathLike[str]) -> Elements:
 
 def write_elements(path: str | os.PathLike[str], elements: Elements, comment: str | None = None) -> None:
     """Write structured arrays as a binary little-endian PLY file."""
-    import plyfile
-
+    plyfile = _plyfile(path)
     described = [plyfile.PlyElement.describe(rows, name) for name, rows in elements.items()]
     content = plyfile.PlyData(described, text=False, byte_order="<", comments=[comment] if comment else [])
     with atomic_path(path) as temporary:
         content.write(os.fspath(temporary))
+
+
+def _plyfile(path: str | os.PathLike[str]) -> Any:
+    try:
+        import plyfile
+    except ImportError:
+        raise InputError(f"{path}: PLY files need plyfile, which is under the GPL: pip install plyfile") from None
+    return plyfile
 
 
 def gaussians_from_elements(path: str | os.PathLike[str], elements: Elements) -> Gaussians:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import logging
 import os
 from pathlib import Path
@@ -12,10 +11,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sgwarp.errors import InputError
-from sgwarp.files.access import read_bytes
+from sgwarp.files.documents import read_json
 from sgwarp.io.colmap_model import find_model, read_points
 from sgwarp.io.colors import rgb_names, unit_colors
+from sgwarp.io.names import inside
 from sgwarp.io.ply import COLOUR, POSITION, columns, read_elements
+from sgwarp.io.world import apply_transform, camera_places, far_origin, transform_of_points
 
 PLY_NAMES = ("points3D.ply", "sparse_pc.ply", "point_cloud.ply")  # beside a transforms.json that names none
 PLY_KEY = "ply_file_path"  # of nerfstudio's transforms.json
@@ -25,16 +26,18 @@ SH_C0 = 0.28209479177387814  # constant of degree 0: color = SH_C0 f_dc + 0.5
 Points = tuple[NDArray[np.float64], NDArray[np.float32]]  # positions [N, 3] [m], colours [N, 3] in [0, 1]
 
 
-def load_points(path: str | os.PathLike[str]) -> Points:
+def load_points(path: str | os.PathLike[str], views: str | os.PathLike[str] | None = None) -> Points:
     """Read the points of a data set, or of one file.
 
     Args:
         path: What `load_views` takes: a folder with transforms.json (whose `ply_file_path` names the points, else
             points3D.ply, sparse_pc.ply or point_cloud.ply beside it) or with a COLMAP model; or a .ply, or a COLMAP
             points3D.bin or .txt.
+        views: Data set that a file of points belongs to: where `load_views` moves its cameras, they move, too.
 
     Returns:
         Positions, float64 [N, 3], and colours in [0, 1], float32 [N, 3]. Points that are not finite are left out.
+        Those of a COLMAP model beside a transforms.json are moved into the world of its cameras (`applied_transform`).
 
     Raises:
         InputError: There is no such file, or it holds no points.
@@ -59,7 +62,21 @@ def load_points(path: str | os.PathLike[str]) -> Points:
         logging.getLogger("sgwarp").warning(
             "%s: left out %d of %d points: not finite", source, int((~finite).sum()), len(positions)
         )
-    return positions[finite], colours[finite].clip(0, 1)
+    return _placed(source, Path(views if views is not None else path), positions[finite]), colours[finite].clip(0, 1)
+
+
+def _placed(source: Path, data_set: Path, positions: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Points of a file in the coordinates that the cameras of their data set have once they are loaded."""
+    if data_set.is_file() and data_set.suffix.lower() != ".json":
+        return positions
+    transforms = data_set if data_set.is_file() else data_set / "transforms.json"
+    if transforms.is_file() and source.suffix.lower() != ".ply":
+        matrix = transform_of_points(transforms, read_json(transforms), source.parent)
+        if matrix is None:
+            raise InputError(f"{source}: its points do not belong to {transforms}; name others, or start without any")
+        positions = apply_transform(matrix, positions)
+    origin = far_origin(camera_places(data_set))
+    return positions if origin is None else positions - origin
 
 
 def find_points(path: str | os.PathLike[str]) -> Path | None:
@@ -84,17 +101,18 @@ def find_points(path: str | os.PathLike[str]) -> Path | None:
 
 def _named_in(transforms: Path) -> Path | None:
     try:
-        meta: Any = json.loads(read_bytes(transforms))
-    except (ValueError, RecursionError):
+        meta: Any = read_json(transforms)
+    except InputError:
         return None  # whoever reads the cameras says what is wrong with the file
     name = meta.get(PLY_KEY) if isinstance(meta, dict) else None
     if name is None:
         return None
     if not isinstance(name, str):
         raise InputError(f"{transforms}: '{PLY_KEY}' must be the name of a file, got {name!r}")
-    named = transforms.parent / name.replace("\\", "/")
+    named = inside(transforms, transforms.parent, name)
     if not named.is_file():
-        raise InputError(f"{transforms}: its '{PLY_KEY}' {name!r} does not exist; copy the file, or remove the entry")
+        logging.getLogger("sgwarp").warning("%s: its '%s' %r does not exist", transforms, PLY_KEY, name)
+        return None
     return named
 
 

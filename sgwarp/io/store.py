@@ -16,12 +16,13 @@ import torch
 from torch import Tensor
 
 from sgwarp.errors import InputError
-from sgwarp.files.access import reading
-from sgwarp.files.atomic import atomic_path
+from sgwarp.files.documents import parse_json
+from sgwarp.files.tensors import read_tensors, write_tensors
 from sgwarp.scene import Gaussians, Semantics
 
 FORMAT = "sgwarp-semantics"
 VERSION = 1
+ROWS_PER_CHECK = 65536
 TENSORS = ("features", "weight", "effective_views")
 # Largest and smallest normal float16: between them rounding is relative, 2^-11.
 HALF_MAX, HALF_MIN = 65504.0, 2.0**-14
@@ -41,8 +42,6 @@ def save_semantics(semantics: Semantics, path: str | os.PathLike[str], notes: Ma
     Raises:
         InputError: Wrong name, or notes that are not JSON.
     """
-    from safetensors.torch import save_file
-
     if Path(path).suffix != ".safetensors":
         raise InputError(f"{path}: semantics are written as .safetensors; change the name")
     features = semantics.features.detach().cpu()
@@ -66,8 +65,7 @@ def save_semantics(semantics: Semantics, path: str | os.PathLike[str], notes: Ma
         "labels": json.dumps(semantics.labels),
         "notes": stored_notes,
     }
-    with atomic_path(path) as temporary:
-        save_file(tensors, temporary, metadata=metadata)
+    write_tensors(path, tensors, metadata)
 
 
 def load_semantics(path: str | os.PathLike[str], gaussians: Gaussians | None = None) -> Semantics:
@@ -77,8 +75,11 @@ def load_semantics(path: str | os.PathLike[str], gaussians: Gaussians | None = N
         InputError: The file is missing, cut short, of another kind or a newer version, or of another scene.
     """
     metadata, tensors = _read(path, TENSORS)
+    _require_numbers(path, tensors)
     try:
-        labels = json.loads(metadata["labels"])
+        labels = parse_json("labels", metadata["labels"], "lift the scene again")
+        if not (labels is None or isinstance(labels, list)):
+            raise ValueError("labels that are no list")
         semantics = Semantics(
             features=tensors["features"],
             weight=tensors["weight"],
@@ -96,6 +97,22 @@ def load_semantics(path: str | os.PathLike[str], gaussians: Gaussians | None = N
     return semantics
 
 
+def _require_numbers(path: str | os.PathLike[str], tensors: Mapping[str, Tensor]) -> None:
+    """Refuse what no lift writes and no query survives: NaN, infinity, negative weights, no channels."""
+    for name, tensor in tensors.items():
+        if not tensor.is_floating_point() or tensor.ndim != (2 if name == "features" else 1):
+            raise InputError(f"{path}: its {name} are {tensor.dtype} {list(tensor.shape)}; lift the scene again")
+        for start in range(0, len(tensor), ROWS_PER_CHECK):
+            rows = tensor[start : start + ROWS_PER_CHECK]
+            good = torch.isfinite(rows) if name == "features" else torch.isfinite(rows) & (rows >= 0)
+            if not bool(good.all()):
+                row = start + int((~good.reshape(len(rows), -1).all(dim=1)).nonzero()[0])
+                fault = "NaN or infinity" if name == "features" else "NaN, infinity or a negative number"
+                raise InputError(f"{path}: its {name} hold {fault}, first in row {row}; lift the scene again")
+    if not tensors["features"].shape[1]:
+        raise InputError(f"{path}: its features have no channels; lift the scene again")
+
+
 def read_notes(path: str | os.PathLike[str]) -> dict[str, Any]:
     """The notes given to `save_semantics`, without reading the features.
 
@@ -103,27 +120,19 @@ def read_notes(path: str | os.PathLike[str]) -> dict[str, Any]:
         InputError: As `load_semantics`.
     """
     metadata, _ = _read(path, ())
-    try:
-        return dict(json.loads(metadata.get("notes", "{}")))
-    except (TypeError, ValueError) as error:
-        raise InputError(f"{path}: its notes are damaged ({error!r}); lift the scene again") from None
+    notes = parse_json(f"{path}: its notes", metadata.get("notes", "{}"), "lift the scene again")
+    if not isinstance(notes, dict):
+        raise InputError(f"{path}: its notes are damaged; lift the scene again")
+    return notes
 
 
 def _read(path: str | os.PathLike[str], names: tuple[str, ...]) -> tuple[dict[str, str], dict[str, Tensor]]:
-    from safetensors import SafetensorError, safe_open
-
-    try:
-        with reading(path), safe_open(os.fspath(path), framework="pt") as content:
-            metadata = content.metadata() or {}
-            if metadata.get("format") != FORMAT:
-                raise InputError(f"{path}: holds no lifted semantics, but other tensors; give the output of a lift")
-            if metadata.get("version") != str(VERSION):
-                raise InputError(
-                    f"{path}: has version {metadata.get('version')}, this program reads {VERSION}; update it"
-                )
-            missing = sorted(set(names) - set(content.keys()))
-            if missing:
-                raise InputError(f"{path}: lacks the tensors {', '.join(missing)}; lift the scene again")
-            return metadata, {name: content.get_tensor(name) for name in names}
-    except SafetensorError as error:
-        raise InputError(f"{path}: is not a safetensors file, or is cut short ({error})") from None
+    metadata, tensors = read_tensors(path, names)
+    if metadata.get("format") != FORMAT:
+        raise InputError(f"{path}: holds no lifted semantics, but other tensors; give the output of a lift")
+    if metadata.get("version") != str(VERSION):
+        raise InputError(f"{path}: has version {metadata.get('version')}, this program reads {VERSION}; update it")
+    missing = sorted(set(names) - set(tensors))
+    if missing:
+        raise InputError(f"{path}: lacks the tensors {', '.join(missing)}; lift the scene again")
+    return metadata, tensors

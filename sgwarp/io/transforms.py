@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import logging
 import math
 import os
@@ -14,10 +13,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sgwarp.errors import InputError
-from sgwarp.files.access import read_bytes
+from sgwarp.files.documents import read_json
 from sgwarp.files.exif import UPRIGHT
 from sgwarp.files.images import read_size
 from sgwarp.io.lens_models import COLMAP_MODELS, LensModel
+from sgwarp.io.names import inside
 from sgwarp.io.photographs import LeftOut, fit_photograph, say_orientations
 from sgwarp.io.stems import IMAGE_SUFFIXES, unique_stems
 from sgwarp.io.undistort import Lens, Listed, pinhole_view
@@ -70,7 +70,7 @@ def read_transforms(path: str | os.PathLike[str], photographs: bool = True) -> l
         name = frame.get("file_path") if isinstance(frame, dict) else None
         if not isinstance(name, str) or not name:
             raise InputError(f"{where}: has no 'file_path'; name the photograph it belongs to")
-        image = _find_image(path.parent, name) if photographs else None
+        image = _find_image(path, name) if photographs else None
         if photographs and image is None:
             left_out.add(MISSING, name)
             continue
@@ -132,8 +132,13 @@ def _view(
 def _belonging(path: Path, frame: Fields, key: str) -> Path | None:
     """A file that a frame names beside its photograph, or None; `_say_ignored` tells of those that do not exist."""
     name = frame.get(key)
-    file = path.parent / name.replace("\\", "/") if isinstance(name, str) and name else None
-    return file if file is not None and os.path.isfile(file) else None
+    if not isinstance(name, str) or not name:
+        return None
+    try:
+        file = inside(path, path.parent, name)
+    except InputError:  # outside the data set: as if it were not there
+        return None
+    return file if os.path.isfile(file) else None
 
 
 def _say_ignored(path: Path, meta: Fields) -> None:
@@ -153,10 +158,7 @@ def _say_ignored(path: Path, meta: Fields) -> None:
 
 
 def _parse(path: Path) -> dict[str, Any]:
-    try:
-        meta = json.loads(read_bytes(path))
-    except (ValueError, RecursionError) as error:
-        raise InputError(f"{path}: is not valid JSON ({error}); copy or export it again") from None
+    meta = read_json(path)
     if not isinstance(meta, dict) or not isinstance(meta.get("frames"), list):
         raise InputError(f"{path}: has no list 'frames'; expected a transforms.json of nerfstudio or instant-ngp")
     if not meta["frames"]:
@@ -164,8 +166,8 @@ def _parse(path: Path) -> dict[str, Any]:
     return meta
 
 
-def _find_image(folder: Path, name: str) -> Path | None:
-    listed = folder / name.replace("\\", "/")
+def _find_image(transforms: Path, name: str) -> Path | None:
+    listed = inside(transforms, transforms.parent, name)
     candidates = (listed, *(listed.with_name(listed.name + suffix) for suffix in IMAGE_SUFFIXES))
     return next((path for path in candidates if os.path.isfile(path)), None)
 

@@ -17,6 +17,7 @@ from sgwarp.errors import InputError
 from sgwarp.files.exif import UPRIGHT, turn
 from sgwarp.io.lens_models import LensModel, distort
 from sgwarp.scene import Camera, View
+from sgwarp.scene.camera import MOST_PIXELS
 
 ZOOM_RANGE = (0.5, 4.0)
 EDGE = 1e-6  # [pixels]
@@ -56,6 +57,8 @@ class Lens:
             )
         if self.width <= 0 or self.height <= 0:
             raise InputError(f"image size must be positive, got {self.width} x {self.height}")
+        if self.width * self.height > MOST_PIXELS:
+            raise InputError(f"image size: {self.width} x {self.height} is more than {MOST_PIXELS} pixels")
 
     @property
     def distorted(self) -> bool:

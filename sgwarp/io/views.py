@@ -8,19 +8,22 @@ from pathlib import Path
 from sgwarp.errors import InputError
 from sgwarp.io.colmap import find_model, read_colmap
 from sgwarp.io.transforms import read_transforms
+from sgwarp.io.world import TRANSFORMS, moved_near_origin
 from sgwarp.scene import View
-
-TRANSFORMS = ("transforms.json", "transforms_train.json")
+from sgwarp.scene.extent import with_near_plane
 
 
 def load_views(path: str | os.PathLike[str], image_folder: str | None = None, photographs: bool = True) -> list[View]:
     """Read posed photographs: transforms.json in the order of its frames, COLMAP sorted by name.
 
+    Near and far planes follow the extent of the cameras, whatever their unit. Cameras that lie far from the origin (UTM
+    coordinates) are moved near it, with a logged notice; `load_points` moves the points of the same data set alike.
+
     Args:
         path: A transforms.json, a folder that holds one, or a COLMAP data set or model. Of a folder with both,
             transforms.json is read.
-        image_folder: COLMAP: name of the folder of photographs, `images` by default; images_4 and the like scale the
-            cameras.
+        image_folder: COLMAP: name or path of the folder of photographs; if None, `images`, or else the only one that
+            holds them; images_4 and the like scale the cameras.
         photographs: False to take the cameras alone; views are then rendered from the scene where an image is needed.
 
     Raises:
@@ -33,11 +36,16 @@ def load_views(path: str | os.PathLike[str], image_folder: str | None = None, ph
     transforms = next((file for file in files if file.is_file()), None)
     if transforms is not None:
         if image_folder is not None:
-            raise InputError(f"{transforms}: lists its photographs by path; image_folder is for COLMAP models only")
-        return read_transforms(transforms, photographs)
+            raise InputError(f"{transforms}: lists its photographs by path; --images is for COLMAP models only")
+        return _placed(path, read_transforms(transforms, photographs))
     if find_model(path) is None:
         raise InputError(
             f"{path}: holds no views; looked for {', '.join(TRANSFORMS)} and for a COLMAP model (cameras.bin or "
             "cameras.txt) in sparse/0, sparse, colmap/sparse/0 and the folder itself"
         )
-    return read_colmap(path, image_folder or "images", photographs)
+    return _placed(path, read_colmap(path, image_folder, photographs))
+
+
+def _placed(source: Path, views: list[View]) -> list[View]:
+    """Near the origin, and with near planes that fit their unit."""
+    return with_near_plane(moved_near_origin(source, views))

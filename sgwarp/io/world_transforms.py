@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 
 from sgwarp.errors import InputError
 from sgwarp.files.access import read_bytes
+from sgwarp.files.arrays import read_array
 from sgwarp.scene import View
 
 TOLERANCE = 1e-3
@@ -32,11 +33,7 @@ def read_world_transform(path: str | os.PathLike[str]) -> NDArray[np.float64]:
     """
     path = Path(path)
     if path.suffix.lower() == ".npy":
-        try:
-            rows: Any = np.load(path, allow_pickle=False)
-        except (ValueError, EOFError, OSError):
-            raise InputError(f"{path}: is not an array that NumPy can read; check the path") from None
-        return _checked(path, rows, 1.0)
+        return _checked(path, read_array(path), 1.0)
     text = read_bytes(path).decode("utf-8", "replace")
     try:
         content = json.loads(text)

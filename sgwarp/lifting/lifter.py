@@ -17,6 +17,7 @@ from sgwarp.ops.launcher import get_threads, set_threads
 from sgwarp.ops.splatting.lifting import LiftSums, lift_view
 from sgwarp.ops.splatting.settings import RasterSettings
 from sgwarp.rendering.renderer import render
+from sgwarp.runs.isolation import isolated
 from sgwarp.runs.log import RunLog
 from sgwarp.runs.progress import Report
 from sgwarp.scene import FeatureMap, Gaussians, Semantics, View
@@ -25,6 +26,7 @@ LiftMode = Literal["weighted", "center"]
 Maps = MapSource | Callable[[View], FeatureMap] | Mapping[str, FeatureMap]
 
 
+@isolated
 def lift(
     gaussians: Gaussians,
     views: Sequence[View],

@@ -9,6 +9,7 @@ from torch import Tensor
 
 from sgwarp.ops.splatting.settings import RasterSettings
 from sgwarp.rendering.renderer import render
+from sgwarp.runs.isolation import isolated
 from sgwarp.scene import Camera, FeatureMap, Gaussians
 
 PIXELS = 20_000  # compared at most: a mean over so many is known to a fraction of a percent
@@ -17,6 +18,7 @@ IMAGE_BYTES = 2**28  # of the channels rendered at once
 Grid = tuple[slice, slice, slice]  # of [L, h, w]
 
 
+@isolated
 def residual(
     gaussians: Gaussians,
     camera: Camera,

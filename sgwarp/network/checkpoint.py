@@ -2,23 +2,19 @@
 
 from __future__ import annotations
 
-import argparse
 import os
-import pickle
-import re
+from functools import lru_cache
 from pathlib import Path
-from typing import Any
 
-import numpy as np
 import torch
 from torch import Tensor
 
 from sgwarp.errors import InputError
-from sgwarp.files.access import reading
+from sgwarp.files.tensors import read_tensors
+from sgwarp.files.torch_files import load_torch
 from sgwarp.network.layers.mink_unet import ARCHITECTURES, MinkUNet
 
 PREFIXES = ("module.", "net3d.")  # of DistributedDataParallel and of OpenScene
-COLOURS = re.compile(r"\x1b\[[0-9;]*m")  # torch prints some of its messages in bold
 SHOWN = 3  # names of each kind in a message
 
 
@@ -29,20 +25,8 @@ def read_weights(path: str | os.PathLike[str]) -> dict[str, Tensor]:
         InputError: The file is missing or damaged, or holds no tensors by name.
     """
     if Path(path).suffix == ".safetensors":
-        from safetensors import SafetensorError
-        from safetensors.torch import load_file
-
-        try:
-            with reading(path):
-                return without_prefixes(load_file(path))
-        except SafetensorError as error:
-            raise InputError(f"{path}: is not a safetensors file, or is cut short ({error})") from None
-    try:
-        with reading(path), torch.serialization.safe_globals(_bystanders()):
-            content = torch.load(path, map_location="cpu", weights_only=True)
-    except (pickle.UnpicklingError, RuntimeError, EOFError, ValueError, LookupError, AttributeError) as error:
-        reason = COLOURS.sub("", next(iter(str(error).splitlines()), type(error).__name__))
-        raise InputError(f"{path}: is no file of plain tensors ({reason}); save its state_dict alone") from None
+        return without_prefixes(read_tensors(path)[1])
+    content = load_torch(path)
     for name in ("state_dict", "model_state_dict", "model"):
         if isinstance(content, dict) and isinstance(content.get(name), dict):
             content = content[name]
@@ -50,19 +34,6 @@ def read_weights(path: str | os.PathLike[str]) -> dict[str, Tensor]:
     if not tensors or not content:
         raise InputError(f"{path}: holds no tensors by name; save the network's state_dict")
     return without_prefixes(content)
-
-
-def _bystanders() -> list[Any]:
-    """Harmless types that training scripts store beside the weights: figures and arguments."""
-    kinds = (np.float64, np.float32, np.int64, np.int32, np.bool_)
-    core = np._core.multiarray  # type: ignore[attr-defined]
-    functions = [
-        (f, f"{module}.multiarray.{f.__name__}")
-        for f in (core.scalar, core._reconstruct)
-        for module in ("numpy._core", "numpy.core")
-    ]
-    dtypes = [type(np.dtype(kind)) for kind in kinds]
-    return [*functions, *dtypes, np.dtype, np.ndarray, argparse.Namespace]
 
 
 def without_prefixes(state: dict[str, Tensor]) -> dict[str, Tensor]:
@@ -90,6 +61,13 @@ def difference(state: dict[str, Tensor], net: MinkUNet) -> str:
     return "; ".join(parts)
 
 
+@lru_cache(maxsize=8)
+def _bare(in_channels: int, out_channels: int, arch: str) -> MinkUNet:
+    """A network without memory for its weights, to compare with."""
+    with torch.device("meta"):
+        return MinkUNet(in_channels, out_channels, arch)
+
+
 def net_for(state: dict[str, Tensor], path: str | os.PathLike[str] = "checkpoint") -> MinkUNet:
     """The network that a state dict belongs to, with its weights.
 
@@ -102,11 +80,10 @@ def net_for(state: dict[str, Tensor], path: str | os.PathLike[str] = "checkpoint
         raise InputError(f"{path}: is no MinkUNet, which has conv0p1s1.kernel and final.kernel; it holds {some}, ...")
     misses: dict[str, tuple[int, str]] = {}
     for arch in ARCHITECTURES:
-        with torch.device("meta"):
-            net = MinkUNet(first.shape[1], last.shape[1], arch)
+        net = _bare(first.shape[1], last.shape[1], arch)
         text = difference(state, net)
         if not text:
-            net = net.to_empty(device="cpu")
+            net = MinkUNet(first.shape[1], last.shape[1], arch)
             net.load_state_dict(state)
             return net
         names = net.state_dict().keys()

@@ -16,8 +16,8 @@ from typing import Any
 import torch
 
 from sgwarp.errors import InputError
-from sgwarp.files.access import reading
-from sgwarp.files.atomic import atomic_path
+from sgwarp.files.documents import parse_json
+from sgwarp.files.tensors import read_tensors, write_tensors
 from sgwarp.network.checkpoint import net_for, read_weights
 from sgwarp.network.inputs import INPUT_CHANNELS, InputMode
 from sgwarp.network.layers.mink_unet import MinkUNet
@@ -73,8 +73,6 @@ def save_network(
     Raises:
         InputError: The name does not end in .safetensors, or it cannot be written.
     """
-    from safetensors.torch import save_file
-
     if Path(path).suffix != ".safetensors":
         raise InputError(f"{path}: networks are written as .safetensors; change the name")
     metadata = {
@@ -87,9 +85,7 @@ def save_network(
         "labels": json.dumps(network.labels),
         "notes": json.dumps(dict(notes or {})),
     }
-    weights = {name: tensor.detach().cpu().contiguous() for name, tensor in network.net.state_dict().items()}
-    with atomic_path(path) as temporary:
-        save_file(weights, temporary, metadata=metadata)
+    write_tensors(path, network.net.state_dict(), metadata)
 
 
 def load_network(
@@ -125,8 +121,12 @@ def load_network(
     try:
         stored: dict[str, Any] = {name: metadata[name] for name in ("inputs", "space")}
         stored["voxel"] = float(metadata["voxel"])
-        labels = json.loads(metadata["labels"])
+        labels = parse_json(f"{path}: labels", metadata["labels"], "train it again")
+        if not (labels is None or isinstance(labels, list)):
+            raise ValueError("labels that are no list")
     except (KeyError, ValueError) as error:
+        if isinstance(error, InputError):
+            raise
         raise InputError(f"{path}: its metadata is damaged ({error!r}); train it again") from None
     for name, value in (("inputs", inputs), ("voxel", voxel), ("space", space)):
         if value is not None and value != stored[name]:
@@ -138,10 +138,7 @@ def _metadata(path: str | os.PathLike[str]) -> dict[str, str] | None:
     """Metadata of a file of ours, None for any other."""
     if Path(path).suffix != ".safetensors":
         return None
-    from safetensors import safe_open
-
-    with reading(path), safe_open(os.fspath(path), framework="pt") as content:
-        metadata: dict[str, str] = content.metadata() or {}
+    metadata, _ = read_tensors(path, ())
     if metadata.get("format") != FORMAT:
         return None
     if metadata.get("version") != str(VERSION):

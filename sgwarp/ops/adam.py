@@ -9,9 +9,10 @@ import warp as wp
 from torch import Tensor
 
 from sgwarp.kernels.fitting import adam as kernels
+from sgwarp.kernels.fitting import adam_elements
 from sgwarp.kernels.fitting import adam_lanes as optimizing_lanes
 from sgwarp.kernels.transmittance import Lanes
-from sgwarp.ops.launcher import launch, view
+from sgwarp.ops.launcher import launch, launch_plain, view
 
 LANE = 16
 BETAS = (float(kernels.BETA_1), float(kernels.BETA_2))
@@ -107,6 +108,7 @@ def update(
     leading: int | None = None,
     rate_of_rest: float = 0.0,
     pull: float = 0.0,
+    by_element: bool | None = None,
 ) -> None:
     """One step of Adam (betas 0.9 and 0.999, epsilon 1e-15) for the rows that take it, and those they waited for.
 
@@ -120,12 +122,15 @@ def update(
         rate: Learning rate of the first `leading` columns, by default all.
         rate_of_rest: Of the others.
         pull: Added to the gradient.
+        by_element: A thread per element instead of one per row; by default on CUDA.
     """
     count, device = len(taken.marks), taken.marks.device
     if not count:
         return
     columns = group.parameters[0].numel()
-    if columns % LANE == 0 and group.form == "plain" and not pull and device.type == "cpu":
+    if by_element is None:
+        by_element = device.type == "cuda"
+    if columns % LANE == 0 and group.form == "plain" and not pull and not by_element:
         _update_wide(group, gradient, taken, columns, rate, columns if leading is None else leading, rate_of_rest)
         return
     rows = [t.view(count, columns) for t in (group.parameters, group.first, group.second, group.values)]
@@ -142,13 +147,17 @@ def update(
         rate_of_rest,
         pull,
     ]
-    launch(kernels.update_rows, count, inputs, [view(t, wp.float32) for t in rows], device=device)
+    outputs = [view(t, wp.float32) for t in rows]
+    if by_element:
+        launch_plain(adam_elements.update_elements, count * columns, inputs, outputs, device=device)
+    else:
+        launch(kernels.update_rows, count, inputs, outputs, device=device)
 
 
 def _update_wide(
     group: Group, gradient: Tensor, taken: Taken, columns: int, rate: float, leading: int, rate_of_rest: float
 ) -> None:
-    rates = torch.full((columns,), rate_of_rest)
+    rates = torch.full((columns,), rate_of_rest, device="cpu")
     rates[:leading] = rate
     shape = (len(taken.marks), columns // LANE, LANE)
     inputs = [view(taken.marks, wp.uint8), view(taken.moves, wp.vec2), view(taken.factors, wp.vec4)]

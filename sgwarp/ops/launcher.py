@@ -9,6 +9,7 @@ from __future__ import annotations
 import itertools
 import math
 import os
+import re
 import sys
 import threading
 import weakref
@@ -23,9 +24,12 @@ import warp as wp
 from torch import Tensor
 
 from sgwarp.errors import InputError
+from sgwarp.ops import kernel_cache
+from sgwarp.ops.kernel_cache import mended
 
 CHUNKS_PER_THREAD = 8  # enough to even out tiles of different cost
 MAX_THREADS = 512
+LEAST_DRIVER = 580  # of NVIDIA, that the wheels of Warp 1.19 take; they are built with CUDA 13
 SMALL = 256  # below this many threads of a launch, a second host thread costs more than it saves
 
 
@@ -34,7 +38,7 @@ def _init_warp() -> None:
     if wp.config.log_level == wp.LOG_INFO:
         wp.config.log_level = wp.LOG_WARNING
     if torch.cuda.is_available():
-        wp.init()
+        kernel_cache.start()
         return
     # The native library writes that warning straight to file descriptor 2, past every setting.
     sys.stderr.flush()
@@ -42,7 +46,7 @@ def _init_warp() -> None:
     sink = os.open(os.devnull, os.O_WRONLY)
     try:
         os.dup2(sink, 2)
-        wp.init()
+        kernel_cache.start()
     finally:
         os.dup2(kept, 2)
         os.close(kept)
@@ -50,6 +54,7 @@ def _init_warp() -> None:
 
 
 _init_warp()
+kernel_cache.tell()
 
 
 def _available_cores() -> int:
@@ -58,9 +63,26 @@ def _available_cores() -> int:
 
 
 _thread_count = _available_cores()
+_streams: dict[tuple[int, int], Any] = {}  # torch's streams as Warp's, by device and handle
+_sorting = threading.Lock()
 _pool: ThreadPoolExecutor | None = None
 _pool_lock = threading.Lock()
 _local = threading.local()
+
+
+def _after_fork() -> None:
+    """In a forked process: threads and locks of the parent do not exist here, its memory is a copy.
+
+    torch's own threads are gone as well, and its OpenMP would wait for them: it works with one, as in a DataLoader.
+    """
+    global _pool, _pool_lock, _local
+    _pool, _pool_lock, _local = None, threading.Lock(), threading.local()
+    _idle.clear()
+    torch.set_num_threads(1)
+
+
+if hasattr(os, "register_at_fork"):
+    os.register_at_fork(after_in_child=_after_fork)
 
 
 def get_threads() -> int:
@@ -114,12 +136,12 @@ def launch(
         return
     head = [0, 0] if slots else [0]
     if device.type == "cuda":
-        stream = wp.stream_from_torch(torch.cuda.current_stream(device))
-        wp.launch(kernel, count, [*head, *inputs], outputs, stream=stream)
+        stream = current_stream(device)
+        mended(kernel, lambda: wp.launch(kernel, count, [*head, *inputs], outputs, stream=stream))
         return
     threads = 1 if chunk is None and count < SMALL else min(_thread_count, count)
     if threads == 1:
-        wp.launch(kernel, count, [*head, *inputs], outputs, device="cpu")
+        mended(kernel, lambda: wp.launch(kernel, count, [*head, *inputs], outputs, device="cpu"))
         return
     size = chunk or max(1, -(-count // (threads * CHUNKS_PER_THREAD)))
     ticket = itertools.count()  # next() is atomic under the interpreter lock
@@ -134,7 +156,7 @@ def launch(
             command.set_dim(min(size, count - base))
             command.launch()
 
-    kernel.module.load("cpu", block_dim=1)  # once, before several threads ask for it
+    mended(kernel, lambda: kernel.module.load("cpu", block_dim=1))  # once, before several threads ask for it
     helpers = [_executor().submit(work, slot) for slot in range(1, threads)]
     try:
         work(0)
@@ -148,13 +170,15 @@ def launch_blocks(
 ) -> None:
     """Run a block-schedule kernel with 256 threads per block; on the CPU the threads are cooperative fibers."""
     if device.type == "cuda":
-        stream = wp.stream_from_torch(torch.cuda.current_stream(device))
-        wp.launch_tiled(kernel, dim=list(grid), inputs=inputs, outputs=outputs, block_dim=256, stream=stream)
+        stream = current_stream(device)
+        tiles = {"dim": list(grid), "inputs": inputs, "outputs": outputs, "block_dim": 256}
+        mended(kernel, lambda: wp.launch_tiled(kernel, **tiles, stream=stream))
         return
     previous = wp.config.enable_cpu_blocks
     wp.config.enable_cpu_blocks = True
     try:
-        wp.launch_tiled(kernel, dim=list(grid), inputs=inputs, outputs=outputs, block_dim=256, device="cpu")
+        tiles = {"dim": list(grid), "inputs": inputs, "outputs": outputs, "block_dim": 256}
+        mended(kernel, lambda: wp.launch_tiled(kernel, **tiles, device="cpu"))
     finally:
         wp.config.enable_cpu_blocks = previous
 
@@ -166,24 +190,109 @@ def launch_plain(
     if count == 0:
         return
     if device.type == "cuda":
-        stream = wp.stream_from_torch(torch.cuda.current_stream(device))
-        wp.launch(kernel, count, inputs, outputs, stream=stream)
+        stream = current_stream(device)
+        mended(kernel, lambda: wp.launch(kernel, count, inputs, outputs, stream=stream))
     else:
-        wp.launch(kernel, count, inputs, outputs, device="cpu")
+        mended(kernel, lambda: wp.launch(kernel, count, inputs, outputs, device="cpu"))
+
+
+def sort_pairs(keys: Tensor, values: Tensor, count: int, key_type: Any, *, end_bit: int | None = None) -> None:
+    """Sort pairs by key, stable, in place.
+
+    Args:
+        keys: Keys, with as much room again behind them, [2 count].
+        values: int32, [2 count].
+        count: How many pairs there are.
+        key_type: Warp's type of the keys.
+        end_bit: The first bit that no key has set.
+    """
+    if not count:
+        return
+    arrays = view(keys, key_type), view(values, wp.int32)
+    if not keys.is_cuda:
+        wp.utils.radix_sort_pairs(*arrays, count, end_bit=end_bit)
+        return
+    # Warp sorts on its own current stream of the current device, whatever the arrays' device and torch's stream. That
+    # stream is Warp's for all threads, hence the lock.
+    with _sorting, wp.ScopedStream(current_stream(keys.device), sync_enter=False):
+        wp.utils.radix_sort_pairs(*arrays, count, end_bit=end_bit)
+
+
+def current_stream(device: torch.device) -> wp.Stream:
+    """torch's current stream of a CUDA device, as Warp's.
+
+    One object is kept for each stream. A temporary one would register and forget the stream in each launch, and take
+    the memory with it that sorting keeps for the stream.
+    """
+    stream = torch.cuda.current_stream(device)
+    key = (stream.device_index, stream.cuda_stream)
+    held = _streams.get(key)
+    if held is None:
+        require_warp(device)
+        held = _streams.setdefault(key, wp.stream_from_torch(stream))
+    return held
+
+
+def warp_device(device: torch.device) -> wp.Device:
+    """The device, as Warp's.
+
+    Raises:
+        InputError: It is one of CUDA, and Warp has none.
+    """
+    require_warp(device)
+    return wp.device_from_torch(device)
+
+
+def require_warp(device: torch.device) -> None:
+    """Refuse a CUDA device that torch has and Warp has not: it wants a newer driver.
+
+    Raises:
+        InputError: Warp has no CUDA device.
+    """
+    if device.type == "cuda" and not wp.is_cuda_available():
+        raise InputError(
+            f"device {device}: Warp {wp.__version__} has no CUDA device here, though torch has one: it needs an NVIDIA "
+            f"driver of version {LEAST_DRIVER} or newer; update the driver, or compute on the CPU"
+        )
+
+
+def find_device(name: str | torch.device) -> torch.device:
+    """The device of this name: "cpu", "cuda" (torch's current one) or "cuda:N".
+
+    Raises:
+        InputError: There is no device of this name, or Warp does not drive it.
+    """
+    match = re.fullmatch(r"cpu|cuda(?::(\d+))?", str(name))
+    if match is None:
+        raise InputError(f"device {name}: expected cpu, cuda or cuda:N")
+    if str(name) == "cpu":
+        return torch.device("cpu")
+    if not torch.cuda.is_available():
+        raise InputError(f"device {name}: this machine or this torch has no CUDA device; use cpu")
+    count = torch.cuda.device_count()
+    index = torch.cuda.current_device() if match[1] is None else int(match[1])
+    if index >= count:
+        raise InputError(f"device {name}: there are {count}, cuda:0 to cuda:{count - 1}")
+    device = torch.device("cuda", index)
+    require_warp(device)
+    return device
 
 
 def view(tensor: Tensor, dtype: Any) -> Any:
     """The tensor's memory as a Warp array, without a copy; vector types take the last dimension."""
+    if tensor.is_cuda:
+        require_warp(tensor.device)
     return wp.from_torch(tensor.detach(), dtype=dtype, requires_grad=False)
 
 
 def scratch(name: str, count: int, dtype: torch.dtype, device: torch.device) -> Tensor:
-    """A flat tensor of at least `count` elements, reused by the next call with this name from the same thread.
+    """A flat tensor of at least `count` elements, reused by the next call with this name, thread and CUDA stream.
 
     Fresh memory costs more than most kernels that write it: the operating system clears every page.
     """
-    store: dict[tuple[str, torch.dtype, torch.device], Tensor] = _local.__dict__.setdefault("store", {})
-    key = (name, dtype, device)
+    store: dict[tuple[str, torch.dtype, torch.device, int], Tensor] = _local.__dict__.setdefault("store", {})
+    stream = torch.cuda.current_stream(device).cuda_stream if device.type == "cuda" else 0
+    key = (name, dtype, device, stream)
     held = store.get(key)
     if held is None or held.numel() < count:
         with torch.inference_mode(False):  # a tensor made under it could never be written to outside again

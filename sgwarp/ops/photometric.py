@@ -9,14 +9,17 @@ import warp as wp
 from torch import Tensor
 
 from sgwarp.errors import InputError
-from sgwarp.kernels.fitting import photometric as kernels
+from sgwarp.kernels.fitting import photometric_block
+from sgwarp.kernels.fitting import photometric_lanes as kernels
 from sgwarp.kernels.transmittance import LANES, Lanes
-from sgwarp.ops.launcher import launch, scratch, view
+from sgwarp.ops.launcher import launch, launch_blocks, scratch, view, warp_device
 
 FLOAT_BYTES = 4
 
 
-def photometric_loss(image: Tensor, truth: Tensor, similarity_share: float = 0.2) -> Tensor:
+def photometric_loss(
+    image: Tensor, truth: Tensor, similarity_share: float = 0.2, *, schedule: str | None = None
+) -> Tensor:
     """(1 - s) mean |x - y| + s (1 - SSIM(x, y)), the loss that 3DGS is fitted with (Kerbl et al. 2023, eq. 7).
 
     SSIM (Wang et al. 2004) has a Gaussian window of 11 x 11 pixels and 1.5 pixels deviation, per channel; outside the
@@ -26,9 +29,10 @@ def photometric_loss(image: Tensor, truth: Tensor, similarity_share: float = 0.2
         image: x, the rendering, float32 [H, W, 3]; has the gradient.
         truth: y, float32 [H, W, 3], in [0, 1].
         similarity_share: s, 0 to 1.
+        schedule: "lanes" or "block", by default the device's own; either runs on the CPU.
 
     Returns:
-        A float32 scalar.
+        A float32 scalar; on CUDA nobody waits for it.
 
     Raises:
         InputError: Shapes or types do not fit.
@@ -39,7 +43,7 @@ def photometric_loss(image: Tensor, truth: Tensor, similarity_share: float = 0.2
         raise InputError(f"truth: expected the image's shape {list(image.shape)}, got {list(truth.shape)}")
     if image.dtype != torch.float32 or truth.dtype != torch.float32:
         raise InputError(f"image and truth: expected float32, got {image.dtype} and {truth.dtype}")
-    loss: Tensor = _Photometric.apply(image, truth, similarity_share)
+    loss: Tensor = _Photometric.apply(image, truth, similarity_share, schedule)
     return loss
 
 
@@ -47,19 +51,40 @@ class _Photometric(torch.autograd.Function):
     """The gradient costs little beside the loss, so that both are computed at once."""
 
     @staticmethod
-    def forward(ctx: Any, image: Tensor, truth: Tensor, share: float) -> Tensor:
-        loss, gradient = _loss_and_gradient(image.detach(), truth.detach(), share)
+    def forward(ctx: Any, image: Tensor, truth: Tensor, share: float, schedule: str | None) -> Tensor:
+        block = (schedule or ("block" if image.device.type == "cuda" else "lanes")) == "block"
+        compute = _in_blocks if block else _in_lanes
+        loss, gradient = compute(image.detach(), truth.detach(), share)
         ctx.save_for_backward(gradient)
         return loss
 
     @staticmethod
     @torch.autograd.function.once_differentiable
-    def backward(ctx: Any, v_loss: Tensor) -> tuple[Tensor, None, None]:
+    def backward(ctx: Any, v_loss: Tensor) -> tuple[Tensor, None, None, None]:
         (gradient,) = ctx.saved_tensors
-        return gradient * v_loss, None, None
+        return gradient * v_loss, None, None, None
 
 
-def _loss_and_gradient(image: Tensor, truth: Tensor, share: float) -> tuple[Tensor, Tensor]:
+def _in_blocks(image: Tensor, truth: Tensor, share: float) -> tuple[Tensor, Tensor]:
+    """Two launches, and no copy to the host."""
+    height, width, channels = image.shape
+    floats, device = width * channels, image.device
+    tile_columns = -(-width // photometric_block.SIDE)
+    tiles = tile_columns * -(-height // photometric_block.SIDE)
+    planes = scratch("photometric derivatives", kernels.ADJOINTS * height * floats, torch.float32, device)
+    derivatives = view(planes.view(kernels.ADJOINTS, height, floats), wp.float32)
+    sums = view(scratch("photometric sums", 2 * tiles, torch.float32, device).view(tiles, 2), photometric_block.Sums)
+    loss, gradient = torch.empty(1, device=device), torch.empty(height, floats, device=device)
+    pair = [view(picture.reshape(height, floats), wp.float32) for picture in (image, truth)]
+    outputs = [derivatives, sums]
+    launch_blocks(photometric_block.compare_tiles, [tiles], [*pair, tile_columns], outputs, device=device)
+    inputs = [derivatives, *pair, sums, tile_columns, share]
+    outputs = [view(gradient, wp.float32), view(loss, wp.float32)]
+    launch_blocks(photometric_block.gather_tiles, [tiles], inputs, outputs, device=device)
+    return loss[0], gradient.view(image.shape)
+
+
+def _in_lanes(image: Tensor, truth: Tensor, share: float) -> tuple[Tensor, Tensor]:
     height, width, channels = image.shape
     floats, device = width * channels, image.device
     x, y = (_in_vectors(name, picture.reshape(height, floats)) for name, picture in (("x", image), ("y", truth)))
@@ -77,9 +102,9 @@ def _loss_and_gradient(image: Tensor, truth: Tensor, share: float) -> tuple[Tens
     inputs = [averaged.shifted, *pair, floats, (1.0 - share) / count, -share / count]
     outputs = [view(gradient, wp.float32), view(rows[1], wp.float32)]
     launch(kernels.gather_gradient, height, inputs, outputs, device=device, chunk=ROWS)
-    similarity, difference = (rows.cpu().to(torch.float64).sum(dim=1) / count).tolist()
+    similarity, difference = rows.to(torch.float64).sum(dim=1) / count
     loss = (1.0 - share) * difference + share * (1.0 - similarity)
-    return torch.tensor(loss, dtype=torch.float32, device=device), gradient.view(image.shape)
+    return loss.to(torch.float32), gradient.view(image.shape)
 
 
 ROWS = 16  # of an image that a host thread takes at once
@@ -101,7 +126,7 @@ class _Planes:
             shape=(count, height, stride - LANES + 1),
             strides=(height * stride * FLOAT_BYTES, stride * FLOAT_BYTES, FLOAT_BYTES),
             capacity=memory.numel() * FLOAT_BYTES,
-            device=wp.device_from_torch(device),
+            device=warp_device(device),
         )
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import Literal, get_args
 
 import torch
@@ -9,6 +10,7 @@ from torch import Tensor
 
 from sgwarp.errors import InputError
 from sgwarp.scene import Semantics
+from sgwarp.scene.semantics import require_together
 
 Ensemble = Literal["2d", "3d", "max", "sum", "mean"]
 
@@ -45,3 +47,23 @@ def seen_by(projected: Semantics, predicted: Semantics | None, how: Ensemble = "
     if predicted is None or how == "2d":
         return projected.seen
     return predicted.seen if how == "3d" else projected.seen | predicted.seen
+
+
+def score_together(
+    score: Callable[[Semantics], Tensor], projected: Semantics, predicted: Semantics | None, how: Ensemble = "max"
+) -> Tensor:
+    """Scores of the projected semantics, or of both as one, [N, Q].
+
+    Args:
+        score: Scores of one of them, [N, Q].
+        projected: Lifted from views.
+        predicted: By the network, for the same Gaussians; None if there are none.
+        how: See `combine`.
+
+    Raises:
+        InputError: The two belong to different scenes or spaces, or an unknown ensemble.
+    """
+    if predicted is None:
+        return score(projected)
+    require_together(projected, predicted)
+    return combine(score(projected), score(predicted), (projected.seen, predicted.seen), how)

@@ -11,13 +11,14 @@ from torch import Tensor
 from sgwarp.encoders.base import TextEncoder
 from sgwarp.encoders.prompts import CANONICAL
 from sgwarp.errors import InputError
-from sgwarp.querying.ensembles import Ensemble, combine, seen_by
+from sgwarp.querying.ensembles import Ensemble, score_together, seen_by
+from sgwarp.runs.isolation import isolated
 from sgwarp.scene import Semantics
-from sgwarp.scene.semantics import require_together
 
 CHUNK = 65536  # Gaussians scored at once: half precision features are widened chunk by chunk
 
 
+@isolated
 def query(semantics: Semantics, texts: Sequence[str], encoder: TextEncoder) -> Tensor:
     """Cosine of every Gaussian's feature with every text, float32 [N, Q]; 0 where nothing was seen.
 
@@ -27,6 +28,7 @@ def query(semantics: Semantics, texts: Sequence[str], encoder: TextEncoder) -> T
     return _cosines(semantics, _encode(semantics, texts, encoder))
 
 
+@isolated
 def relevancy(
     semantics: Semantics,
     texts: Sequence[str],
@@ -60,6 +62,7 @@ def standardise(scores: Tensor, seen: Tensor) -> Tensor:
     return torch.where(seen[:, None], scaled, 0.0).to(scores.dtype)
 
 
+@isolated
 def evidence(scores: Tensor, semantics: Semantics) -> Tensor:
     """Scores [N, Q] standardized over the scene and weighted by how well each Gaussian was seen.
 
@@ -104,6 +107,7 @@ TEMPERATURES: dict[Scoring, float] = {"evidence": 0.3, "cosine": 0.1}
 NONE_LEVEL = 1.0  # evidence of "none of these": a class must stand out further from the scene's mean
 
 
+@isolated
 def class_votes(
     semantics: Semantics,
     classes: Sequence[str] | None,
@@ -136,33 +140,44 @@ def class_votes(
         InputError: No classes, or an encoder missing, where one is needed; a class that is not among the lifted labels;
             predicted semantics of another scene or space.
     """
-    both = [semantics]
-    if predicted is not None:
-        require_together(semantics, predicted)
-        both.append(predicted)
     seen = seen_by(semantics, predicted, ensemble)
     if semantics.labels is not None:
-        if predicted is None:
-            return _label_shares(semantics, classes)
-        # A sum of shares is twice their mean; the largest of both may add up to more than all there is.
-        how: Ensemble = "mean" if ensemble == "sum" else ensemble
-        total = _together([_label_shares(one, None) for one in both], both, how).sum(dim=1, keepdim=True)
-        return _together([_label_shares(one, classes) for one in both], both, how) / total.clamp(min=1.0)
+        return _label_votes(semantics, classes, predicted, ensemble)
     if not classes:
         raise InputError(f"classes: semantics in space '{semantics.space}' need the names of the classes to look for")
     if encoder is None:
         raise InputError(f"encoder: classes need the text encoder of space '{semantics.space}'")
     if scoring not in TEMPERATURES:
         raise InputError(f"scoring: expected one of {', '.join(TEMPERATURES)}, got '{scoring}'")
-    each = [query(one, classes, encoder) for one in both]
+
+    def score(one: Semantics) -> Tensor:
+        cosines = query(one, classes, encoder)
+        return evidence(cosines, one) if scoring == "evidence" else cosines
+
+    scores = score_together(score, semantics, predicted, ensemble)
     if scoring == "evidence":
-        each = [evidence(scores, one) for scores, one in zip(each, both, strict=True)]
-    scores = _together(each, both, ensemble)
-    if scoring == "evidence":
-        level = NONE_LEVEL * (2 if len(both) == 2 and ensemble == "sum" else 1)
-        scores = torch.cat([scores, torch.full_like(scores[:, :1], level)], dim=1)
+        none = torch.full_like(scores[:, :1], none_level(predicted, ensemble))
+        scores = torch.cat([scores, none], dim=1)
     votes = confidence(scores, TEMPERATURES[scoring] if temperature is None else temperature)[:, : len(classes)]
     return torch.where(seen.to(votes.device)[:, None], votes, 0.0)
+
+
+def none_level(predicted: Semantics | None, ensemble: Ensemble) -> float:
+    """Evidence of "none of these": a sum of two scores has to exceed twice the level."""
+    return NONE_LEVEL * (2 if predicted is not None and ensemble == "sum" else 1)
+
+
+def _label_votes(
+    semantics: Semantics, classes: Sequence[str] | None, predicted: Semantics | None, ensemble: Ensemble
+) -> Tensor:
+    """Shares of the labels, which add up to 1 or less also in an ensemble, [N, Q]."""
+    if predicted is None:
+        return _label_shares(semantics, classes)
+    # A sum of shares is twice their mean; the largest of both may add up to more than all there is.
+    how: Ensemble = "mean" if ensemble == "sum" else ensemble
+    total = score_together(lambda one: _label_shares(one, None), semantics, predicted, how).sum(dim=1, keepdim=True)
+    shares = score_together(lambda one: _label_shares(one, classes), semantics, predicted, how)
+    return shares / total.clamp(min=1.0)
 
 
 def _label_shares(semantics: Semantics, classes: Sequence[str] | None) -> Tensor:
@@ -174,13 +189,6 @@ def _label_shares(semantics: Semantics, classes: Sequence[str] | None) -> Tensor
     if missing:
         raise InputError(f"class '{missing[0]}' is not among the lifted labels: {', '.join(semantics.labels)}")
     return semantics.features[:, [semantics.labels.index(name) for name in classes]].to(torch.float32)
-
-
-def _together(scores: list[Tensor], semantics: list[Semantics], ensemble: Ensemble) -> Tensor:
-    """Scores of the one semantics there is, or of the ensemble of the two, [N, Q]."""
-    if len(scores) == 1:
-        return scores[0]
-    return combine(scores[0], scores[1], (semantics[0].seen, semantics[1].seen), ensemble)
 
 
 def select(scores: Tensor, threshold: float | None = None, top_share: float | None = None) -> Tensor:

@@ -17,12 +17,15 @@ from sgwarp.ops.splatting.forward import rasterize
 from sgwarp.ops.splatting.settings import RasterSettings
 from sgwarp.querying.ensembles import Ensemble, seen_by
 from sgwarp.querying.scores import Scoring, class_votes
+from sgwarp.runs.isolation import isolated
 from sgwarp.scene import Camera, Gaussians, Semantics
 
 UNKNOWN = 255  # label of a pixel that no class can claim
+BOX = 9  # side of the box over which a query's scores are averaged before the best pixel is taken [pixels]
 KNOWN_OPACITY = 0.5  # least opacity that seen Gaussians must add up to at a pixel
 
 
+@isolated
 def splat_scores(
     gaussians: Gaussians,
     camera: Camera,
@@ -54,6 +57,7 @@ def splat_scores(
     return blended[..., :-1] / torch.where(opacity > 0, opacity, 1.0), known
 
 
+@isolated
 def segment(
     gaussians: Gaussians,
     semantics: Semantics,
@@ -146,6 +150,7 @@ def label_image(channel: Tensor, lifted: Semantics | None = None) -> Tensor:
     return ids[channel]  # -1 is the last entry
 
 
+@isolated
 def localize(
     scores: Tensor,
     gaussians: Gaussians,

@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 
 from sgwarp.errors import InputError
 from sgwarp.reconstruction.rgbd import Pixels, observe
+from sgwarp.runs.isolation import isolated
 from sgwarp.runs.progress import Report
 from sgwarp.scene import Gaussians, View
 
@@ -33,6 +34,7 @@ LEAST_SHRINK = 0.5  # of a deviation, by which PIXEL_BLUR may reduce it
 FLATNESS = 0.1  # least deviation along the normal, in the largest one
 
 
+@isolated
 def gaussians_from_depth(
     views: Sequence[View],
     depths: Callable[[View], Any],

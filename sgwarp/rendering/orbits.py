@@ -8,6 +8,7 @@ import torch
 from torch import Tensor
 
 from sgwarp.errors import InputError
+from sgwarp.runs.isolation import isolated
 from sgwarp.scene import Camera, Gaussians, View
 
 FIELD_OF_VIEW = math.radians(50)  # along the shorter side of the image
@@ -21,6 +22,7 @@ UP = {
 }
 
 
+@isolated
 def orbit_views(gaussians: Gaussians, count: int, width: int, height: int, up: str = "y-down") -> list[View]:
     """Views on one turn around the scene, looking at the median of its centres, named orbit_000 and so on.
 

@@ -41,16 +41,20 @@ class RunLog:
     curve: list[dict[str, float]] = field(default_factory=list)
 
     @contextmanager
-    def stage(self, name: str) -> Iterator[None]:
-        """Add the time spent in the block to stage `name`; one stage may be entered many times."""
+    def stage(self, name: str, wait: bool = True) -> Iterator[None]:
+        """Add the time spent in the block to stage `name`; one stage may be entered many times.
+
+        On CUDA the block ends when its work is done; with `wait` off, when it is launched, and the next stage that
+        waits is charged with the rest.
+        """
         start = time.perf_counter()
         try:
             yield
         finally:
-            if self.device.startswith("cuda"):
+            if wait and self.device.startswith("cuda"):
                 import torch
 
-                torch.cuda.synchronize(self.device)  # launches return before their work is done
+                torch.cuda.synchronize(self.device)
             self.stages[name] = self.stages.get(name, 0.0) + time.perf_counter() - start
 
     def leave_out(self, what: str, amount: float = 1) -> None:

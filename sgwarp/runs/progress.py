@@ -8,6 +8,8 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from typing import TextIO
 
+from sgwarp.errors import printable
+
 Report = Callable[[int, int, str], None]  # items done, items in all, name of the item at work
 
 LOG_INTERVAL = 30.0  # seconds between two lines in a log file
@@ -26,6 +28,7 @@ def show_progress(title: str, stream: TextIO | None = None) -> Iterator[Report]:
         return
     try:
         from rich.console import Console
+        from rich.markup import escape
         from rich.progress import Progress
     except ImportError:
         with _redrawn_line(title, stream) as report:
@@ -33,7 +36,9 @@ def show_progress(title: str, stream: TextIO | None = None) -> Iterator[Report]:
         return
     with Progress(console=Console(file=stream), transient=True) as bar:
         task = bar.add_task(title, total=None)
-        yield lambda done, total, name: bar.update(task, completed=done, total=total, description=f"{title} {name}")
+        yield lambda done, total, name: bar.update(
+            task, completed=done, total=total, description=f"{title} {escape(printable(name))}"
+        )
 
 
 @contextmanager
@@ -44,7 +49,7 @@ def _lines(title: str, stream: TextIO) -> Iterator[Report]:
         nonlocal last
         if time.monotonic() - last >= LOG_INTERVAL:
             last = time.monotonic()
-            print(f"{title} {done}/{total} {name}", file=stream, flush=True)
+            print(f"{title} {done}/{total} {printable(name)}", file=stream, flush=True)
 
     yield report
 
@@ -55,7 +60,7 @@ def _redrawn_line(title: str, stream: TextIO) -> Iterator[Report]:
 
     def report(done: int, total: int, name: str) -> None:
         nonlocal width
-        line = f"{title} {done}/{total} {name}"
+        line = f"{title} {done}/{total} {printable(name)}"
         stream.write("\r" + line.ljust(width))
         stream.flush()
         width = len(line)

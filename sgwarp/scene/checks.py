@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from typing import Any
 
+import numpy as np
 import torch
 from torch import Tensor
 
@@ -15,9 +16,39 @@ def require(condition: bool, message: str) -> None:
         raise InputError(message)
 
 
+def as_tensor(value: Any, dtype: torch.dtype | None = None) -> Tensor:
+    """The tensor where it is, anything else as a tensor of the CPU, whatever torch's default device."""
+    if isinstance(value, Tensor):
+        return value if dtype is None else value.to(dtype)
+    return torch.as_tensor(value, dtype=dtype, device="cpu")
+
+
+def dense(name: str, value: Any) -> Tensor:
+    """A tensor as it is, and what NumPy or a list of numbers holds as one.
+
+    Raises:
+        InputError: It is neither, or sparse.
+    """
+    if not isinstance(value, Tensor):
+        try:
+            array = np.asarray(value)
+            require(array.dtype.kind in "biuf", f"{name}: expected a tensor or an array of numbers, got {_kind(value)}")
+            value = as_tensor(array if array.flags.writeable else array.copy())
+        except (TypeError, ValueError, RuntimeError, OverflowError) as error:
+            if isinstance(error, InputError):
+                raise
+            raise InputError(f"{name}: expected a tensor or an array of numbers, got {_kind(value)}") from None
+    require(value.layout == torch.strided, f"{name}: expected a dense tensor, got {value.layout}; call to_dense()")
+    return value
+
+
+def _kind(value: Any) -> str:
+    return type(value).__name__
+
+
 def float32(name: str, value: Any, shape: tuple[int | None, ...]) -> Tensor:
     """Convert to a contiguous float32 tensor of `shape` (None matches any size)."""
-    tensor = torch.as_tensor(value)
+    tensor = dense(name, value)
     require(tensor.is_floating_point(), f"{name}: expected floating point values, got {tensor.dtype}")
     fits = tensor.ndim == len(shape) and all(w is None or w == s for w, s in zip(shape, tensor.shape, strict=False))
     wanted = ", ".join("any" if s is None else str(s) for s in shape)

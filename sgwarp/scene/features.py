@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from sgwarp.scene.checks import float32, require
+from sgwarp.scene.checks import as_tensor, float32, require
 
 
 @dataclass(frozen=True, eq=False)
@@ -37,17 +37,17 @@ class FeatureMap:
         require(bool(self.space), "space: a feature map must name its embedding space")
         require((self.dense is None) != (self.ids is None), "give either dense features or ids, not both or none")
         if self.dense is not None:
-            dense = torch.as_tensor(self.dense)
+            dense = as_tensor(self.dense)
             ok = dense.ndim == 3 and dense.is_floating_point() and dense.numel() > 0
             require(ok, f"dense: expected floating point [h, w, C], got {dense.dtype} {list(dense.shape)}")
             put(self, "dense", dense)
             if self.valid is not None:
-                valid = torch.as_tensor(self.valid, dtype=torch.bool)
+                valid = as_tensor(self.valid, torch.bool)
                 fits = valid.shape == dense.shape[:2]
                 require(fits, f"valid: expected {list(dense.shape[:2])}, got {list(valid.shape)}")
                 put(self, "valid", valid)
             return
-        ids = torch.as_tensor(self.ids)
+        ids = as_tensor(self.ids)
         require(not ids.is_floating_point(), f"ids: expected integers, got {ids.dtype}")
         ids = ids[None] if ids.ndim == 2 else ids
         require(ids.ndim == 3 and ids.numel() > 0, f"ids: expected shape [L, h, w], got {list(ids.shape)}")

@@ -4,11 +4,10 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-import torch
 from torch import Tensor
 
 from sgwarp.errors import InputError
-from sgwarp.scene.checks import float32, require
+from sgwarp.scene.checks import as_tensor, float32, require
 from sgwarp.scene.gaussians import Gaussians
 
 
@@ -34,7 +33,7 @@ class Semantics:
 
     def __post_init__(self) -> None:
         put = object.__setattr__
-        features = torch.as_tensor(self.features)
+        features = as_tensor(self.features)
         ok = features.ndim == 2 and features.is_floating_point()
         require(ok, f"features: expected floating point [N, C], got {features.dtype} {list(features.shape)}")
         put(self, "features", features)

@@ -52,8 +52,7 @@ def lifted(stage_files, tmp_path_factory):
 @pytest.fixture
 def text_semantics(stage, stage_files, toy_text, tmp_path, monkeypatch):
     """Semantics of a toy text space on disk, and its text encoder in the registry."""
-    registry = pytest.importorskip("sgwarp.encoders.registry")
-    monkeypatch.setattr(registry, "text_encoder_for", lambda space, *rest: toy_text)
+    monkeypatch.setattr("sgwarp.encoders.registry.text_encoder_for", lambda space, *rest: toy_text)
     path = tmp_path / "text.safetensors"
     save_semantics(lift(stage_files.gaussians, stage.views, stage.dense), path)
     return path
@@ -225,7 +224,7 @@ def test_version(capsys):
     assert capsys.readouterr().out.strip()
 
 
-@pytest.mark.parametrize("arguments", [[], ["lift"], ["nonsense"], ["info", "a.ply", "--device", "tpu"]])
+@pytest.mark.parametrize("arguments", [[], ["lift"], ["nonsense"], ["info", "a.ply", "--threads", "x"]])
 def test_usage_errors_end_with_code_2(arguments, capsys):
     with pytest.raises(SystemExit) as end:
         main(arguments)
@@ -272,7 +271,12 @@ def test_bad_input_is_one_line(stage, stage_files, lifted, tmp_path, capsys):
 
 def test_cuda_on_a_machine_without(stage_files, capsys, monkeypatch):
     monkeypatch.setattr(torch.cuda, "is_available", lambda: False)
-    assert "no CUDA device" in fails(capsys, "info", stage_files.scene, "--device", "cuda")
+    for name in ("cuda", "cuda:1"):
+        assert f"--device {name}: this machine" in fails(capsys, "info", stage_files.scene, "--device", name)
+
+
+def test_a_device_that_does_not_exist(stage_files, capsys):
+    assert "expected cpu, cuda or cuda:N" in fails(capsys, "info", stage_files.scene, "--device", "tpu")
 
 
 def test_interrupt_leaves_nothing_behind(stage_files, tmp_path, monkeypatch, capsys):

@@ -13,6 +13,8 @@ from torch import Tensor
 from sgwarp.compat import gsplat
 from sgwarp.ops.reference import rasterizer as reference
 
+pytestmark = pytest.mark.slow
+
 BATCH, CAMERAS = 2, 2
 BOUNDARY_BAND = 1e-4  # pixels nearer than this to a threshold, or to a change of the order, may flip in float32
 ORDER_BAND = 1e-6
@@ -115,11 +117,9 @@ def compare(compare_with, raw, mode, antialiased, packed, channels=None, by_cova
     compare_with(loss, point, {name: leaf.grad for name, leaf in t.items() if name not in unused})
 
 
-@pytest.mark.parametrize("packed", [False, True])
-@pytest.mark.parametrize("antialiased", [False, True])
-@pytest.mark.parametrize("mode", ["RGB", "RGB+D", "RGB+ED"])
-def test_batches_and_cameras(raw, assert_central_differences, mode, antialiased, packed):
-    compare(assert_central_differences, raw, mode, antialiased, packed)
+@pytest.mark.parametrize(("mode", "antialiased"), [("RGB", False), ("RGB", True), ("RGB+D", True), ("RGB+ED", False)])
+def test_batches_and_cameras(raw, assert_central_differences, mode, antialiased):
+    compare(assert_central_differences, raw, mode, antialiased, packed=False)
 
 
 @pytest.mark.parametrize("mode", ["D", "ED"])

@@ -120,6 +120,7 @@ def test_gradients(raw, principal, scale, antialiasing, sh):
     assert (means2D.grad - proxy).abs().max() <= 1e-3 * proxy.abs().max()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("antialiasing", [False, True])
 @pytest.mark.parametrize("given", ["shs", "colors_precomp", "cov3D_precomp"])
 def test_gradients_match_central_differences(raw, assert_central_differences, given, antialiasing):

@@ -21,6 +21,8 @@ from sgwarp.lifting.lifter import lift
 from sgwarp.metrics.segmentation import ConfusionMatrix
 from sgwarp.scene import Camera, View
 
+pytestmark = pytest.mark.slow
+
 BUILDER = Path(__file__).resolve().parents[2] / "tools" / "build_demo_room.py"
 
 

@@ -1,6 +1,9 @@
 """The disk cache: nothing is encoded twice, nothing wrong is ever given back."""
 
+import io
 import os
+import shutil
+import zipfile
 
 import numpy as np
 import pytest
@@ -10,7 +13,7 @@ from sgwarp.encoders import cache
 from sgwarp.encoders.base import MapSource, TextEncoder
 from sgwarp.encoders.cache import CachedMaps, default_folder, pack, shrink, unpack
 from sgwarp.errors import InputError
-from sgwarp.scene import FeatureMap
+from sgwarp.scene import Camera, FeatureMap, View
 
 
 class Source:
@@ -192,3 +195,101 @@ def test_bad_places(tmp_path):
         CachedMaps(Source(), tmp_path / "file" / "below")
     with pytest.raises(InputError, match="limit above 0"):
         CachedMaps(Source(), tmp_path, limit=0.0)
+
+
+class Failing:
+    """A source of id maps with a cache key."""
+
+    space, needs_image = "mine", True
+
+    def __init__(self) -> None:
+        self.asked = 0
+
+    def cache_key(self, view):
+        return view.stem
+
+    def encode(self, view, image):
+        self.asked += 1
+        ids = torch.full(image.shape[:2], int(view.stem) % 2)
+        return FeatureMap("mine", ids=ids, vectors=torch.eye(2))
+
+
+def two_views() -> list[View]:
+    K = torch.tensor([[10.0, 0, 8], [0, 10, 6], [0, 0, 1]])
+    return [View(stem, Camera(K, torch.eye(4), 16, 12)) for stem in ("0", "1")]
+
+
+def test_maps_that_cannot_be_kept_cost_one_notice(tmp_path, caplog, disk):
+    source = Failing()
+    cached = CachedMaps(source, tmp_path)
+    with disk(50):
+        maps = [cached.encode(view, torch.zeros(12, 16, 3)) for view in two_views() for _ in range(2)]
+    assert [int(found.ids.flatten()[0]) for found in maps] == [0, 0, 1, 1]
+    assert source.asked == 4
+    assert caplog.text.count("maps are not kept") == 1
+    assert os.listdir(tmp_path) == []
+
+
+def test_the_entry_of_another_view_is_not_used(tmp_path):
+    source = Failing()
+    first, second = two_views()
+    image = torch.zeros(12, 16, 3)
+    CachedMaps(source, tmp_path).encode(first, image)
+    (one,) = tmp_path.iterdir()
+    CachedMaps(source, tmp_path).encode(second, image)
+    (two,) = set(tmp_path.iterdir()) - {one}
+    shutil.copy(one, two)
+    cached = CachedMaps(source, tmp_path)
+    assert int(cached.encode(second, image).ids.flatten()[0]) == 1
+    assert source.asked == 3
+    assert cached.hits == 0
+    assert int(cached.encode(second, image).ids.flatten()[0]) == 1
+    assert cached.hits == 1
+
+
+HEADER = b"\x93NUMPY\x01\x00\x3c\x00{'descr':'<f4','fortran_order':False,'shape':((((2,2,3)}     \n"
+
+
+@pytest.mark.parametrize("damage", ["folder", "header", "deep", "empty", "huge"])
+def test_a_damaged_entry_is_made_again(tmp_path, damage):
+    source = Failing()
+    view, image = two_views()[1], torch.zeros(12, 16, 3)
+    CachedMaps(source, tmp_path).encode(view, image)
+    (path,) = tmp_path.iterdir()
+    path.unlink()
+    if damage == "folder":
+        (path / "below").mkdir(parents=True)
+    elif damage == "empty":
+        path.touch()
+    else:
+        content = {
+            "header": {"header": HEADER},
+            "deep": {"header": numpy_bytes(b"[" * 100_000)},
+            "huge": {"header": HEADER.replace(b"((((2,2,3)", b"(99999999,)")},
+        }[damage]
+        with zipfile.ZipFile(path, "w") as archive:
+            for name, data in content.items():
+                archive.writestr(f"{name}.npy", data)
+    for _ in range(2):
+        assert int(CachedMaps(source, tmp_path).encode(view, image).ids.flatten()[0]) == 1
+    assert source.asked == 2
+    assert path.is_file()
+
+
+def numpy_bytes(text: bytes) -> bytes:
+    buffer = io.BytesIO()
+    np.save(buffer, np.frombuffer(text, np.uint8))
+    return buffer.getvalue()
+
+
+def test_the_limit_counts_what_others_write_and_removes_what_they_left(tmp_path):
+    from sgwarp.files.atomic import _machine
+
+    dead = tmp_path / f".a.map.{_machine()}-4194999-00000000.npz"
+    writing = tmp_path / f".b.map.{_machine()}-1-00000000.npz"
+    old, new = tmp_path / "old.map.npz", tmp_path / "new.map.npz"
+    for number, path in enumerate((dead, writing, old, new)):
+        path.write_bytes(bytes(1000))
+        os.utime(path, (10**9 + number, 10**9 + number) if path != writing else None)
+    shrink(tmp_path, 2500 / 1e9)
+    assert {path.name for path in tmp_path.iterdir()} == {writing.name, new.name}

@@ -171,6 +171,7 @@ def test_missing_weights_are_not_replaced_by_random_ones(joint_models, tmp_path)
 
 
 def test_no_network_says_what_to_do():
+    pytest.importorskip("transformers")
     with pytest.raises(InputError, match="hf download nobody/nothing --local-dir DIR"):
         JointEncoder("nobody/nothing")
 

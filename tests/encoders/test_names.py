@@ -8,6 +8,7 @@ import pytest
 import torch
 
 from sgwarp.encoders import catalogue
+from sgwarp.encoders.building import builder
 from sgwarp.encoders.cache import CachedMaps
 from sgwarp.encoders.catalogue import BY_NAME, KINDS
 from sgwarp.encoders.compose import Crops, MaskedImages, PaintedInstances, PlainPixels, RefinedPixels
@@ -157,3 +158,14 @@ def test_what_is_installed(monkeypatch):
     assert BY_NAME["openseg"].missing == ["tensorflow"]
     assert BY_NAME["lseg"].missing == []
     assert BY_NAME["graph"].missing == []
+
+
+@pytest.mark.parametrize("kind", KINDS, ids=lambda kind: kind.name)
+def test_a_row_carries_its_builder(kind):
+    """In the folder of its role; nothing else has to know an encoder."""
+    made = "make_masks" if kind.role == "masks" else "make_source"
+    assert kind.make.startswith(f"sgwarp.encoders.{kind.role}.")
+    assert kind.make.endswith(f":{made}")
+    assert callable(builder(kind.make))
+    if kind.speak:
+        assert callable(builder(kind.speak))

@@ -299,7 +299,7 @@ def test_missing_photographs_are_counted(dataset, caplog):
     path = dataset([PINHOLE], [image("a.png"), image("b.png"), image("c.png")], absent=["a.png", "b.png"])
     with caplog.at_level(logging.WARNING, logger="sgwarp"):
         assert [view.stem for view in read_colmap(path)] == ["c"]
-    assert "left out 2 images without photograph, first a.png" in caplog.text
+    assert "left out 2 images without photograph, first 'a.png'" in caplog.text
 
 
 def test_no_photographs_at_all(dataset, tmp_path):

@@ -156,7 +156,7 @@ def test_foreign_files(tmp_path):
     with pytest.raises(InputError, match=r"s\.safetensors: weight: expected shape \[3\], got \[4\]"):
         load_semantics(path)
     save_file(tensors, path, metadata={**good, "notes": "[1"})
-    with pytest.raises(InputError, match="its notes are damaged"):
+    with pytest.raises(InputError, match="its notes: is not valid JSON"):
         read_notes(path)
 
 
@@ -182,3 +182,50 @@ def test_damaged_anywhere(tmp_path_factory, allow_input_error, position, value):
         load_semantics(path)
     with allow_input_error(path):
         read_notes(path)
+
+
+@pytest.mark.parametrize("name", ["features", "weight", "effective_views"])
+@pytest.mark.parametrize("value", [float("nan"), float("inf"), -1.0])
+def test_numbers_no_query_survives(tmp_path, name, value):
+    from sgwarp.files.tensors import write_tensors
+
+    tensors = {"features": torch.ones(3, 2), "weight": torch.ones(3), "effective_views": torch.ones(3)}
+    good = {"format": "sgwarp-semantics", "version": "1", "labels": "null", "space": "x", "fingerprint": "f"}
+    write_tensors(tmp_path / "s.safetensors", tensors, good)
+    assert load_semantics(tmp_path / "s.safetensors").features.shape == (3, 2)
+    tensors[name][1] = value
+    write_tensors(tmp_path / "s.safetensors", tensors, good)
+    if name == "features" and value == -1.0:
+        assert load_semantics(tmp_path / "s.safetensors").features[1].tolist() == [-1, -1]
+        return
+    with pytest.raises(InputError, match=rf"its {name} hold NaN.*first in row 1; lift the scene again"):
+        load_semantics(tmp_path / "s.safetensors")
+
+
+def test_no_channels(tmp_path):
+    from sgwarp.files.tensors import write_tensors
+
+    tensors = {"features": torch.ones(3, 0), "weight": torch.ones(3), "effective_views": torch.ones(3)}
+    good = {"format": "sgwarp-semantics", "version": "1", "labels": "null", "space": "x", "fingerprint": "f"}
+    write_tensors(tmp_path / "s.safetensors", tensors, good)
+    with pytest.raises(InputError, match="its features have no channels"):
+        load_semantics(tmp_path / "s.safetensors")
+
+
+@pytest.mark.parametrize("entry", ["labels", "notes"])
+def test_deep_metadata(tmp_path, entry):
+    from sgwarp.files.tensors import write_tensors
+
+    tensors = {"features": torch.ones(3, 2), "weight": torch.ones(3), "effective_views": torch.ones(3)}
+    about = {"format": "sgwarp-semantics", "version": "1", "labels": "null", "space": "x", "fingerprint": "f"}
+    write_tensors(tmp_path / "s.safetensors", tensors, about | {entry: "[" * 100_000})
+    with pytest.raises(InputError, match="is nested deeper"):
+        (load_semantics if entry == "labels" else read_notes)(tmp_path / "s.safetensors")
+
+
+def test_the_same_semantics_are_the_same_bytes(tmp_path):
+    numbers = torch.rand(5, 3, generator=torch.Generator().manual_seed(0))
+    for name in "ab":
+        semantics = Semantics(numbers, torch.ones(5), torch.ones(5), "mine", "0")
+        save_semantics(semantics, tmp_path / f"{name}.safetensors", {"encoder": "x", "views": 3})
+    assert (tmp_path / "a.safetensors").read_bytes() == (tmp_path / "b.safetensors").read_bytes()

@@ -113,7 +113,7 @@ def test_missing_photographs_are_counted(dataset, caplog):
     with caplog.at_level(logging.WARNING, logger="sgwarp"):
         views = read_transforms(path)
     assert [view.stem for view in views] == ["0", "2", "4"]
-    assert "left out 2 frames without photograph, first images/1.png" in caplog.text
+    assert "left out 2 frames without photograph, first 'images/1.png'" in caplog.text
 
 
 def test_all_photographs_missing(dataset, tmp_path):

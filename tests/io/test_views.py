@@ -68,12 +68,14 @@ def test_image_folder(tmp_path):
     colmap(tmp_path, "x")
     (tmp_path / "images").rename(tmp_path / "photos")
     assert stems(tmp_path, image_folder="photos") == ["x"]
+    assert stems(tmp_path) == ["x"]  # the only folder that holds them
+    (tmp_path / "photos").rename(tmp_path / "emptied")
+    for file in (tmp_path / "emptied").iterdir():
+        file.unlink()
     with pytest.raises(InputError, match="no folder 'images' of photographs"):
         load_views(tmp_path)
     transforms(tmp_path, "x")
-    with pytest.raises(
-        InputError, match=r"transforms\.json: lists its photographs by path; image_folder is for COLMAP"
-    ):
+    with pytest.raises(InputError, match=r"transforms\.json: lists its photographs by path; --images is for COLMAP"):
         load_views(tmp_path, image_folder="photos")
 
 

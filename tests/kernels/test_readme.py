@@ -80,6 +80,40 @@ def test_every_file_is_listed():
     assert files == set(re.findall(r"`([\w/]+\.py)`", README.split("## Files")[1].split("## Two schedules")[0]))
 
 
+# What the README says in numbers, and where the code says it: file, constant, sentence with {} for its value.
+FIGURES = [
+    (
+        "points/neighbors.py",
+        "FAN",
+        "boxes around {} points `low`, `high`, around {} boxes `large_low`, `large_high`, and around {} of those",
+    ),
+    ("binning.py", "TILE", "owns a {} x {} tile"),
+    ("transmittance.py", "LANES", "the {} pixels of a row are one vector"),
+    ("projection/lanes.py", "GROUP", "takes {} Gaussians to a vector"),
+    ("compositing/block.py", "BLOCK", "{} threads own a tile"),
+    ("compositing/lanes.py", "BATCH", "`batch` [slots, {}] splats"),
+    ("compositing/lanes_features.py", "PASS", "`features` [N, S, 1] of {} channels"),
+    ("lifting/shared.py", "MAX_IDS", "`tile_ids` [tiles, {}]"),
+    ("sparse/convolution_lanes.py", "COLUMNS", "C_out / {}, C_in, {}] flat"),
+    ("sparse/convolution_lanes.py", "GRADIENT_GROUP", "groups of {} C_in"),
+    ("binning.py", "SPANS", "first four tile rows"),
+]
+
+
+def constant(file: str, name: str) -> float:
+    """A number, or `wp.constant` of one, at the top of a kernel file."""
+    for node in ast.parse((KERNELS / file).read_text(encoding="utf-8")).body:
+        if isinstance(node, ast.Assign) and ast.unparse(node.targets[0]) == name:
+            value = node.value.args[0] if isinstance(node.value, ast.Call) else node.value
+            return ast.literal_eval(value)
+    raise AssertionError(f"{file} has no constant {name}")
+
+
+@pytest.mark.parametrize(("file", "name", "sentence"), FIGURES)
+def test_figures_are_those_of_the_code(file, name, sentence):
+    assert sentence.replace("{}", str(constant(file, name))) in " ".join(README.split())
+
+
 def test_the_example_runs(capsys):
     examples = re.findall(r"```python\n(.*?)```", README, flags=re.DOTALL)
     assert len(examples) == 1

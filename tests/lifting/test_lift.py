@@ -19,6 +19,7 @@ from sgwarp.scene import FeatureMap, View
 MODES = ("weighted", "center")
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("mode", MODES)
 def test_equals_the_mean_of_the_oracles_sums(stage, mode):
     views = [View(view.stem, view.camera.resized(36, 48)) for view in stage.views[:3]]
@@ -135,6 +136,42 @@ def test_residual_is_measured_before_its_view_is_lifted(stage):
     log = RunLog()
     lift(stage.gaussians, stage.views[:2], contrary, log=log)
     assert log.error["residual"] > 0.9
+
+
+def test_the_view_in_the_middle_is_held_back(stage):
+    """Of five views that one contradicts the others: its residual alone is large."""
+
+    def contrary(wrong: int):
+        def labels(view: View) -> FeatureMap:
+            ids = stage.labels(view) - 1
+            turned = torch.where(ids >= 0, 3 - ids, -1)
+            return FeatureMap("labels", ids=turned if view is stage.views[wrong] else ids, labels=("1", "2", "3", "4"))
+
+        return labels
+
+    residuals = []
+    for wrong in range(5):
+        log = RunLog()
+        lift(stage.gaussians, stage.views[:5], contrary(wrong), log=log)
+        residuals.append(log.error["residual"])
+    assert residuals[2] > 0.9
+    assert max(residuals[:2] + residuals[3:]) < 0.5
+
+
+@pytest.mark.parametrize("image_bytes", [0, 2**28])  # slices of 16 channels, and all of them at once
+def test_residual_of_many_labels(stage, monkeypatch, image_bytes):
+    """Forty labels, of which four are shown, in different slices: the figure is that of the four alone."""
+    monkeypatch.setattr(sys.modules["sgwarp.lifting.residuals"], "IMAGE_BYTES", image_bytes)
+    names = tuple(str(k) for k in range(40))
+    places = torch.tensor([5, 17, 33, 39, -1])
+
+    def sparse(view: View) -> FeatureMap:
+        return FeatureMap("labels", ids=places[stage.labels(view) - 1], labels=names)
+
+    few, many = RunLog(), RunLog()
+    lift(stage.gaussians, stage.views, stage.one_hot, log=few)
+    lift(stage.gaussians, stage.views, sparse, log=many)
+    assert many.error["residual"] == pytest.approx(few.error["residual"], abs=1e-6)
 
 
 def test_residual_falls_on_a_view_that_has_a_map(stage):

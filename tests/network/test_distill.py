@@ -6,6 +6,7 @@ import os
 import subprocess
 import sys
 from dataclasses import replace
+from types import SimpleNamespace
 
 import pytest
 import torch
@@ -19,11 +20,14 @@ from sgwarp.network.inputs import voxelize
 from sgwarp.network.layers.mink_unet import ARCHITECTURES, Architecture, MinkUNet
 from sgwarp.network.prediction import predict
 from sgwarp.network.semantic_network import load_network
+from sgwarp.network.training import trainer
 from sgwarp.network.training.data import TrainingScene, make_example, reliability, scenes_in
 from sgwarp.network.training.settings import DistillSettings
 from sgwarp.network.training.trainer import distill, state_path
 from sgwarp.runs.log import RunLog
 from sgwarp.scene import Gaussians, Semantics
+
+pytestmark = pytest.mark.slow
 
 SETTINGS = DistillSettings(arch="tiny", voxel=0.12, epochs=2, augment=Augmentation(up=1, elastic=()))
 
@@ -218,6 +222,27 @@ def test_unreliable_targets_count_less(stage):
 
     assert agreement(True) > 0.99
     assert agreement(False) < 0.9
+
+
+@pytest.mark.parametrize("by_reliability", [False, True])
+def test_the_loss_weighs_voxels_by_their_reliability(stage, by_reliability):
+    """The mean of 1 - cosine, in float64 from what the network says and what the example holds."""
+    g = stage.gaussians
+    random = torch.Generator().manual_seed(3)
+    weight = 10 ** (3 * torch.rand(len(g), generator=random) - 2)
+    semantics = replace(lifted(g, stage.classes), weight=weight, effective_views=torch.full((len(g),), 2.0))
+    settings = replace(SETTINGS, augment=None, by_reliability=by_reliability)
+    kind = "labels", 4, ("1", "2", "3", "4")
+    run = trainer._Run(settings, kind, None, trainer.Processes(), torch.device("cpu"), RunLog())
+    example = run._example(in_memory("stage", g, semantics), torch.Generator())
+    assert (example.weights.std() > 0.05) == by_reliability
+    said = torch.randn(len(example.voxels.features), 4, generator=random)
+    run.network = SimpleNamespace(net=lambda voxels: SimpleNamespace(features=said))
+    ours = torch.nn.functional.normalize(said[example.rows].double(), dim=1)
+    cosine = (ours * example.targets.double()).sum(dim=1)
+    expected = ((1 - cosine) * example.weights.double()).sum() / example.weights.double().sum()
+    assert float(run._loss(example)) == pytest.approx(float(expected), abs=1e-6)
+    assert by_reliability == (abs(float(expected) - float((1 - cosine).mean())) > 1e-4)
 
 
 @pytest.mark.parametrize("field", ["space", "features", "labels"])

@@ -1,14 +1,22 @@
 """The optimiser row by row against float64 Adam, its sparsity, and the noise."""
 
+from functools import partial
+
 import pytest
 import torch
 
-from sgwarp.ops import launcher
+from sgwarp.ops import adam, launcher
 from sgwarp.ops.adam import Group, add_noise, count_steps, note_gradients, update, values_of
 from sgwarp.ops.reference import fitting as reference_fit
 from sgwarp.ops.reference.rasterizer import rotation_matrices
 
 ROWS, STEPS = 40, 25
+
+
+@pytest.fixture(autouse=True, params=["rows", "elements"])
+def _threads(request, monkeypatch):
+    """Every test runs with a thread per row and, as on CUDA, per element."""
+    monkeypatch.setitem(globals(), "update", partial(adam.update, by_element=request.param == "elements"))
 
 
 def by_parameters(values: torch.Tensor, form: str) -> torch.Tensor:

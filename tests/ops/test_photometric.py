@@ -22,13 +22,15 @@ def pictures(height: int, width: int, kind: str) -> tuple[torch.Tensor, torch.Te
     return truth + noise if kind == "noisy" else 3.0 * noise, truth
 
 
+@pytest.mark.parametrize("schedule", ["lanes", "block"])
 @pytest.mark.parametrize("kind", ["noisy", "flat", "unlike"])
 @pytest.mark.parametrize("size", [(1, 1), (3, 5), (11, 16), (37, 29), (48, 64)])
-def test_loss_and_gradient_are_those_of_the_oracle(size, kind):
+def test_loss_and_gradient_are_those_of_the_oracle(size, kind, schedule):
     image, truth = pictures(*size, kind)
     for share in (0.0, 0.2, 1.0):
         ours, theirs = image.clone().requires_grad_(), image.double().requires_grad_()
-        loss, expected = photometric_loss(ours, truth, share), reference_fit.photometric_loss(theirs, truth, share)
+        loss = photometric_loss(ours, truth, share, schedule=schedule)
+        expected = reference_fit.photometric_loss(theirs, truth, share)
         loss.backward()
         expected.backward()
         assert abs(loss.item() - expected.item()) < TOLERANCES[kind][0]

@@ -107,6 +107,22 @@ def test_votes_of_unseen_gaussians_are_zero(random_semantics):
     torch.testing.assert_close(votes[seen].sum(dim=1), torch.ones(199))
 
 
+@pytest.mark.parametrize(("scoring", "temperature"), [("cosine", 0.1), ("evidence", 0.3)])
+def test_temperatures_of_the_two_scorings(random_semantics, scoring, temperature):
+    """The softmax in closed form; "evidence" has one more column, of 1 deviation, for none of the names."""
+    names, encoder = ["cup", "sofa", "lamp"], Phrases(24)
+    scores = query(random_semantics, names, encoder).double()
+    seen = random_semantics.seen
+    if scoring == "evidence":
+        scores = (scores - scores[seen].mean(dim=0)) / scores[seen].std(dim=0, correction=0) / 2  # all weights are 1
+        scores = torch.cat([scores, torch.ones(len(scores), 1)], dim=1)
+    expected = torch.softmax(scores / temperature, dim=1)[:, :3] * seen[:, None]
+    votes = class_votes(random_semantics, names, encoder, scoring=scoring)
+    torch.testing.assert_close(votes.double(), expected, atol=1e-5, rtol=0)
+    softer = class_votes(random_semantics, names, encoder, 2.0, scoring)
+    assert softer[seen].std() < 0.5 * votes[seen].std()
+
+
 def test_standardised_votes_silence_a_loud_class():
     """All features lean towards the first class, half of them less: those go to the second one."""
     features = torch.tensor([[0.9, 0.1], [0.8, 0.3]]).repeat(10, 1)

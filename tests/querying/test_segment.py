@@ -10,7 +10,7 @@ from sgwarp.lifting.lifter import lift
 from sgwarp.metrics.segmentation import ConfusionMatrix
 from sgwarp.querying.scores import query
 from sgwarp.querying.segmentation import UNKNOWN, box_mean, label_image, localize, segment, splat_scores
-from sgwarp.scene import Semantics
+from sgwarp.scene import Camera, Gaussians, Semantics
 
 NAMES = ["wall", "left door", "lamp", "book"]
 
@@ -152,6 +152,22 @@ def test_box_mean_against_a_loop():
                 ]
                 expected[y, x] = sum(window) / len(window) if window else 0.0
         torch.testing.assert_close(box_mean(image, known, side), expected, atol=1e-6, rtol=0)
+
+
+@pytest.mark.parametrize(("opacity", "known"), [(0.45, False), (0.55, True)])
+def test_a_pixel_is_known_from_half_an_opacity_on(opacity, known):
+    """A single Gaussian, far wider than the view."""
+    camera = Camera(torch.tensor([[20.0, 0, 8], [0, 20, 8], [0, 0, 1]]), torch.eye(4), 16, 16)
+    wall = Gaussians(
+        torch.tensor([[0.0, 0, 2]]),
+        torch.tensor([[1.0, 0, 0, 0]]),
+        torch.full((1, 3), 100.0),
+        torch.tensor([opacity]),
+        torch.zeros(1, 1, 3),
+    )
+    mean, seen = splat_scores(wall, camera, torch.tensor([[0.7]]), torch.tensor([True]))
+    assert (seen == known).all()
+    torch.testing.assert_close(mean, torch.full_like(mean, 0.7))
 
 
 def test_refusals(stage, toy_semantics, toy_text, held_out):

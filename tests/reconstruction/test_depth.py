@@ -105,6 +105,16 @@ def test_pixels_do_not_bridge_a_jump():
     assert uniform[20, 5] > 1
 
 
+@pytest.mark.parametrize(("footprints", "followed"), [(2.5, True), (3.5, False), (15.0, False)])
+def test_two_pixels_alone_are_one_surface_only_if_they_lie_close(footprints, followed):
+    """Columns in pairs: no third pixel tells a slope from a jump, so only a small change is taken for a slope."""
+    depth = np.zeros((HEIGHT, WIDTH), np.float32)  # nothing between the pairs
+    depth[:, 0:-1:3], depth[:, 1::3] = 3.0, 3.0 + footprints * 3.0 / FOCAL
+    pixels = observe(camera(), depth, np.full((HEIGHT, WIDTH, 3), 0.5, np.float32))
+    assert (np.abs(pixels.right[:, 2]) > 0.5 * footprints * 3.0 / FOCAL).all() == followed
+    assert np.any(pixels.right[:, 2]) == followed
+
+
 def test_colour_edges_are_not_uniform():
     rgb = np.full((HEIGHT, WIDTH, 3), 0.5, np.float32)
     rgb[:, 30:] = 0.8

@@ -28,6 +28,7 @@ from sgwarp.compat.gsplat.projection import quat_scale_to_covar_preci as quat_sc
 from sgwarp.ops.planar.harmonics import harmonics_sum
 from sgwarp.ops.planar.projection import CAMERA_MODELS, ProjectedSplats, ProjectionSettings, select_rows
 from sgwarp.ops.planar.splats import SplatJob, composite_splats
+from sgwarp.runs.isolation import isolated
 
 RENDER_MODES = ("RGB", "D", "ED", "RGB+D", "RGB+ED")
 RASTERIZE_MODES = ("classic", "antialiased")
@@ -43,6 +44,7 @@ class RollingShutterType(Enum):
     GLOBAL = 4
 
 
+@isolated
 def rasterization(
     means: Tensor,
     quats: Tensor | None,

@@ -14,11 +14,13 @@ from sgwarp.ops.planar.harmonics import harmonics_sum
 from sgwarp.ops.planar.intersections import first_entries, intersect_boxes
 from sgwarp.ops.planar.pixel_lists import composite_pairs, contributors_in_range
 from sgwarp.ops.planar.splats import ListedSplats, SplatJob, composite_splats, factors_from_conics
+from sgwarp.runs.isolation import isolated
 
 ALPHA_MAX = 0.999
 MAX_SH_DEGREE = 4
 
 
+@isolated
 def isect_tiles(
     means2d: Tensor,
     radii: Tensor,
@@ -80,6 +82,7 @@ def isect_offset_encode(isect_ids: Tensor, n_images: int, tile_width: int, tile_
     return first_entries(isect_ids, n_images, tile_width, tile_height)
 
 
+@isolated
 def rasterize_to_pixels(
     means2d: Tensor,
     conics: Tensor,
@@ -135,9 +138,7 @@ def rasterize_to_pixels(
     absolute = torch.zeros_like(flat[0]) if absgrad else None
     if absolute is not None:
         means2d.absgrad = absolute.view(means2d.shape)  # type: ignore[attr-defined]
-    ends = torch.cat(
-        [isect_offsets.reshape(count, -1)[:, 0].to(torch.int64), torch.tensor([len(flatten_ids)])]
-    ).tolist()
+    ends = [*isect_offsets.reshape(count, -1)[:, 0].tolist(), len(flatten_ids)]
     colors_out, alphas_out = [], []
     for i in range(count):
         listed = flatten_ids[ends[i] : ends[i + 1]]
@@ -179,6 +180,7 @@ def _only_tiles(mask: Tensor, listed: Tensor, offsets: Tensor) -> tuple[Tensor, 
     return listed[kept], torch.cat([offsets[:1], (sizes * mask).cumsum(0, dtype=torch.int32)])
 
 
+@isolated
 def rasterize_to_indices_in_range(
     range_start: int,
     range_end: int,
@@ -224,6 +226,7 @@ def rasterize_to_indices_in_range(
     return splats % max(N, 1), pixels % size, pixels // size
 
 
+@isolated
 def accumulate(
     means2d: Tensor,
     conics: Tensor,
@@ -261,6 +264,7 @@ def accumulate(
     return image.reshape(*shape, channels), alpha.reshape(*shape, 1)
 
 
+@isolated
 def spherical_harmonics(degrees_to_use: int, dirs: Tensor, coeffs: Tensor, masks: Tensor | None = None) -> Tensor:
     """Real spherical harmonics summed with coefficients, as `gsplat.spherical_harmonics` does.
 

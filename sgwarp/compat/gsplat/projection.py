@@ -14,6 +14,7 @@ from sgwarp.ops.planar.projection import (
     rotation_matrices,
     unpack_symmetric,
 )
+from sgwarp.runs.isolation import isolated
 
 
 def project_images(
@@ -58,6 +59,7 @@ def project_images(
     return splats
 
 
+@isolated
 def fully_fused_projection(
     means: Tensor,
     covars: Tensor | None,
@@ -123,6 +125,7 @@ def fully_fused_projection(
     return *ids, *(table.join(column) for column in columns), *([] if calc_compensations else [None])
 
 
+@isolated
 def quat_scale_to_covar_preci(
     quats: Tensor,
     scales: Tensor,

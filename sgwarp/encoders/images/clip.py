@@ -14,6 +14,9 @@ import torch
 from torch import Tensor
 from torch.nn.functional import normalize
 
+from sgwarp.encoders.base import MapSource
+from sgwarp.encoders.building import Request, some, source_of_images, source_of_pixels
+from sgwarp.encoders.names import Member, Part
 from sgwarp.encoders.prompts import PHOTO, Phrases
 from sgwarp.encoders.weights import (
     Preparation,
@@ -133,3 +136,19 @@ class JointEncoder:
             return self.model.visual_projection(vision.post_layernorm(values[:, 1:]))
         tokens = found.last_hidden_state
         return vision.head(tokens.flatten(0, 1)[:, None]).unflatten(0, tokens.shape[:2])
+
+
+def make_source(member: Member, request: Request) -> MapSource:
+    """The squares around masks; without masks, or with `rule=pixels`, what the network says of every patch."""
+    rule = member.source.options.get("rule", "images")
+    if rule not in ("images", "pixels"):
+        raise InputError(f"encoder '{request.name}': rule is images or pixels, not '{rule}'")
+    encoder = make_text(member.source, request)
+    if member.masks is None or rule == "pixels":
+        return source_of_pixels(encoder, member.masks, request)
+    return source_of_images(encoder, member.masks, request)
+
+
+def make_text(part: Part, request: Request) -> JointEncoder:
+    """Image and text side are one network."""
+    return JointEncoder(part.argument, device=request.device, **some(part, "longest"), **request.templates_of(part))

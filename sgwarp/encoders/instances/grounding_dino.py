@@ -7,8 +7,10 @@ from collections.abc import Iterator, Sequence
 import torch
 from torch import Tensor
 
-from sgwarp.encoders.base import Instances
+from sgwarp.encoders.base import Instances, MapSource
+from sgwarp.encoders.building import Request, own, source_of_instances
 from sgwarp.encoders.instances.detections import DetectorSettings, keep_detections
+from sgwarp.encoders.names import Member
 from sgwarp.encoders.weights import (
     Preparation,
     channels_first,
@@ -22,6 +24,7 @@ from sgwarp.scene import View
 
 STRIDE = 32  # of the backbone's last level: sides are multiples of it
 END = "."  # what separates the phrases of a prompt
+LEAST_SCORE = 0.25  # of a box, if none is asked for
 
 
 class GroundingDino:
@@ -116,3 +119,11 @@ class GroundingDino:
             }
             yield first, asked, torch.tensor([*owners, -1])
             first += count
+
+
+def make_source(member: Member, request: Request) -> MapSource:
+    """Its boxes, or the masks inside them, as the text side embeds their names."""
+    part = member.source
+    settings = DetectorSettings(**{"least_score": LEAST_SCORE, **own(part, DetectorSettings)})
+    detector = GroundingDino(part.argument, part.options.get("classes", ()), settings, request.device)
+    return source_of_instances(detector, member, request)

@@ -8,8 +8,10 @@ import torch
 from torch import Tensor
 from torch.nn.functional import pad
 
-from sgwarp.encoders.base import Instances
+from sgwarp.encoders.base import Instances, MapSource
+from sgwarp.encoders.building import Request, own, source_of_instances
 from sgwarp.encoders.instances.detections import DetectorSettings, keep_detections
+from sgwarp.encoders.names import Member
 from sgwarp.encoders.prompts import PHOTO, fill_templates
 from sgwarp.encoders.weights import (
     Preparation,
@@ -23,6 +25,7 @@ from sgwarp.errors import InputError
 from sgwarp.scene import View
 
 GREY = 0.5  # of the square around the image
+LEAST_SCORE = 0.1  # of a box, if none is asked for
 
 
 class Owlv2:
@@ -82,3 +85,12 @@ class Owlv2:
         return keep_detections(
             found.pred_boxes[0].cpu(), names, best.sigmoid(), self.settings, (height, width), longest
         )
+
+
+def make_source(member: Member, request: Request) -> MapSource:
+    """Its boxes, or the masks inside them, as the text side embeds their names."""
+    part = member.source
+    settings = DetectorSettings(**{"least_score": LEAST_SCORE, **own(part, DetectorSettings)})
+    classes, templates = part.options.get("classes", ()), request.templates_of(part)
+    detector = Owlv2(part.argument, classes, settings=settings, device=request.device, **templates)
+    return source_of_instances(detector, member, request)

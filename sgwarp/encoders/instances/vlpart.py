@@ -11,7 +11,6 @@ The network needs detectron2, which is not on PyPI; it is run elsewhere, and wri
 from __future__ import annotations
 
 import hashlib
-import json
 import os
 from collections.abc import Mapping
 from pathlib import Path
@@ -21,10 +20,14 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from sgwarp.encoders.base import Instances, MissingMap
-from sgwarp.encoders.maps.feature_files import load_archive
+from sgwarp.encoders.base import Instances, MapSource, MissingMap
+from sgwarp.encoders.building import Request, source_of_instances
+from sgwarp.encoders.names import Member
 from sgwarp.errors import InputError
 from sgwarp.files.access import read_bytes
+from sgwarp.files.arrays import read_arrays
+from sgwarp.files.documents import read_json
+from sgwarp.files.image_headers import largest_image
 from sgwarp.scene import View
 
 SUFFIXES = (".json", ".npz")
@@ -85,10 +88,7 @@ def plain_name(name: str) -> str:
 
 
 def _read_json(path: Path) -> Instances:
-    try:
-        content = json.loads(read_bytes(path))
-    except ValueError as error:
-        raise InputError(f"{path}: is not JSON ({error})") from None
+    content = read_json(path)
     rows = content.get("instances") if isinstance(content, Mapping) else None
     if not isinstance(rows, list):
         raise InputError(f'{path}: expected {{"instances": [...]}}')
@@ -97,7 +97,7 @@ def _read_json(path: Path) -> Instances:
         names = [str(row["name"]) for row in rows]
         scores = [float(row["score"]) for row in rows]
         masks = [decode_rle(row["mask"]) for row in rows if row.get("mask") is not None]
-    except (KeyError, TypeError, ValueError, IndexError, AttributeError) as error:
+    except (KeyError, TypeError, ValueError, IndexError, AttributeError, OverflowError) as error:
         raise InputError(f"{path}: an instance is damaged ({error!r})") from None
     if masks and (len(masks) < len(names) or len({mask.shape for mask in masks}) > 1):
         raise InputError(f"{path}: {len(masks)} of {len(names)} instances have a mask, or masks differ in size")
@@ -106,17 +106,21 @@ def _read_json(path: Path) -> Instances:
 
 
 def _read_npz(path: Path) -> Instances:
-    arrays = load_archive(path)
+    arrays = read_arrays(path, texts=True)
     missing = [name for name in ("boxes", "names", "scores") if name not in arrays]
     if missing:
         raise InputError(f"{path}: lacks the array {missing[0]}")
     try:
         boxes = torch.from_numpy(arrays["boxes"].astype(np.float32)).reshape(-1, 4)
         scores = [float(score) for score in arrays["scores"]]
-    except (ValueError, TypeError, RuntimeError) as error:
+    except (ValueError, TypeError, RuntimeError, OverflowError) as error:
         raise InputError(f"{path}: boxes [K, 4] and scores [K] must be numbers ({error})") from None
     masks = torch.from_numpy(arrays["masks"].astype(bool)) if "masks" in arrays else None
-    return _checked(path, boxes, [str(name) for name in arrays["names"]], scores, masks)
+    try:
+        names = [str(name) for name in arrays["names"]]
+    except (ValueError, TypeError):
+        raise InputError(f"{path}: names [K] must be texts") from None
+    return _checked(path, boxes, names, scores, masks)
 
 
 def _checked(
@@ -140,6 +144,8 @@ def decode_rle(mask: Mapping[str, Any]) -> NDArray[np.bool_]:
         KeyError, ValueError, IndexError: It is damaged.
     """
     height, width = (int(side) for side in mask["size"])
+    if not (height > 0 and width > 0 and height * width <= largest_image()):
+        raise ValueError(f"a mask of {height} x {width} pixels")
     counts = mask["counts"]
     runs = _decode_counts(counts) if isinstance(counts, str) else [int(count) for count in counts]
     if sum(runs) != height * width or min(runs, default=0) < 0:
@@ -167,3 +173,9 @@ def _decode_counts(text: str) -> list[int]:
                 value -= 1 << shift
         runs.append(value + (runs[-2] if len(runs) > 2 else 0))
     return runs
+
+
+def make_source(member: Member, request: Request) -> MapSource:
+    """Its masks, as the text side embeds their names."""
+    part = member.source
+    return source_of_instances(VLPartFiles(part.argument, **part.options), member, request)

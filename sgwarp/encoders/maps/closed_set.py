@@ -6,7 +6,10 @@ import torch
 from torch import Tensor
 from torch.nn.functional import interpolate
 
+from sgwarp.encoders.base import MapSource
+from sgwarp.encoders.building import Request
 from sgwarp.encoders.maps.files import LABEL_SPACE
+from sgwarp.encoders.names import Member
 from sgwarp.encoders.weights import (
     Preparation,
     channels_first,
@@ -88,3 +91,8 @@ def class_shares(classes: Tensor, masks: Tensor) -> Tensor:
         masks: Logits, [Q, h, w].
     """
     return torch.einsum("qk,qyx->kyx", classes.float().softmax(dim=-1)[:, :-1], masks.float().sigmoid())
+
+
+def make_source(member: Member, request: Request) -> MapSource:
+    """Shares of the classes that it was trained on."""
+    return ClosedSet(member.source.argument, device=request.device, **member.source.options)

@@ -8,7 +8,6 @@ An id means the same thing in all views, so the maps are one-hot in the space "l
 
 from __future__ import annotations
 
-import json
 import os
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -17,9 +16,12 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from sgwarp.encoders.base import MapSource
+from sgwarp.encoders.building import Request
 from sgwarp.encoders.maps.files import FileMaps
+from sgwarp.encoders.names import Member
 from sgwarp.errors import InputError
-from sgwarp.files.access import read_bytes
+from sgwarp.files.documents import read_json
 from sgwarp.scene import FeatureMap, View
 
 
@@ -79,13 +81,18 @@ def read_predictions(path: Path) -> dict[str, dict[int, float]]:
         InputError: The file is missing or damaged.
     """
     try:
-        content = json.loads(read_bytes(path))
+        content = read_json(path)
         return {Path(frame["file_name"]).stem: _scores(frame["segments_info"]) for frame in content["annotations"]}
     except InputError:
         raise
-    except (ValueError, TypeError, KeyError) as error:
+    except (ValueError, TypeError, KeyError, OverflowError, AttributeError) as error:
         raise InputError(f"{path}: is not the pred.json of DEVA, or is damaged ({error!r})") from None
 
 
 def _scores(segments: Sequence[Mapping[str, Any]]) -> dict[int, float]:
     return {int(segment["id"]): float(segment.get("score", 1.0)) for segment in segments}
+
+
+def make_source(member: Member, request: Request) -> MapSource:
+    """The ids of the views that are asked for."""
+    return DevaMaps(member.source.argument, request.views, **member.source.options)

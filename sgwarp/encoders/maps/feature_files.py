@@ -2,20 +2,18 @@
 
 from __future__ import annotations
 
-import pickle
-import zipfile
-import zlib
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, Literal
 
-import numpy as np
 import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
 from sgwarp.errors import InputError
-from sgwarp.files.access import reading
+from sgwarp.files.arrays import read_array, read_arrays
+from sgwarp.files.tensors import read_tensors
+from sgwarp.files.torch_files import load_torch
 from sgwarp.io.undistort import same_shape as same_shape
 
 FEATURE_SUFFIXES = (".npy", ".npz", ".pt", ".pth", ".safetensors")
@@ -23,37 +21,6 @@ FEATURE_KEYS = ("features", "feat", "dense", "arr_0")  # of files that hold more
 VALID_KEY = "valid"
 
 Layout = Literal["chw", "hwc"]
-
-
-def load_array(path: Path) -> NDArray[Any]:
-    """The array in a .npy file.
-
-    Raises:
-        InputError: The file is missing, damaged or holds Python objects.
-    """
-    with reading(path), open(path, "rb") as file:
-        try:
-            return np.lib.format.read_array(file, allow_pickle=False)
-        except (ValueError, EOFError) as error:
-            raise InputError(f"{path}: is not a NumPy array of numbers, or is cut short ({_line(error)})") from None
-
-
-def load_archive(path: Path) -> dict[str, NDArray[Any]]:
-    """The arrays in an .npz file by name.
-
-    Raises:
-        InputError: The file is missing, damaged or holds Python objects.
-    """
-    with reading(path), open(path, "rb") as file:
-        try:
-            with np.load(file, allow_pickle=False) as content:
-                if not isinstance(content, np.lib.npyio.NpzFile):
-                    raise InputError(f"{path}: holds a single array; expected an .npz of arrays")
-                return {name: content[name] for name in content.files}
-        except (ValueError, EOFError, KeyError, RuntimeError, zipfile.BadZipFile, zlib.error) as error:
-            if isinstance(error, InputError):
-                raise
-            raise InputError(f"{path}: is not an .npz of arrays, or is damaged ({_line(error)})") from None
 
 
 def load_features(path: Path) -> tuple[Tensor, Tensor | None]:
@@ -104,18 +71,12 @@ def channels_last(path: Path, features: Tensor, size: tuple[int, int], layout: L
 def _load_tensors(path: Path) -> dict[str, Tensor]:
     """Every array of a file by name; an unnamed one is called 'features'."""
     if path.suffix == ".npy":
-        return {"features": _tensor(path, load_array(path))}
+        return {"features": _tensor(path, read_array(path))}
     if path.suffix == ".npz":
-        return {name: _tensor(path, array) for name, array in load_archive(path).items()}
-    with reading(path), open(path, "rb") as file:
-        try:
-            if path.suffix == ".safetensors":
-                return _load_safetensors(path)
-            content = torch.load(file, map_location="cpu", weights_only=True)
-        except (ValueError, EOFError, KeyError, RuntimeError, zipfile.BadZipFile, pickle.UnpicklingError) as error:
-            if isinstance(error, InputError):
-                raise
-            raise InputError(f"{path}: is not a {path.suffix} file of arrays, or is damaged ({_line(error)})") from None
+        return {name: _tensor(path, array) for name, array in read_arrays(path).items()}
+    if path.suffix == ".safetensors":
+        return read_tensors(path)[1]
+    content = load_torch(path)
     if isinstance(content, Tensor):
         return {"features": content}
     if isinstance(content, Mapping):
@@ -123,25 +84,8 @@ def _load_tensors(path: Path) -> dict[str, Tensor]:
     raise InputError(f"{path}: holds a {type(content).__name__}; expected a tensor or a dict of tensors")
 
 
-def _load_safetensors(path: Path) -> dict[str, Tensor]:
-    try:
-        from safetensors import SafetensorError
-        from safetensors.torch import load_file
-    except ImportError:
-        raise InputError(f'{path}: reading it needs safetensors: pip install "sgwarp[cli]"') from None
-    try:
-        return load_file(path)
-    except SafetensorError as error:
-        raise InputError(f"{path}: is not a safetensors file, or is damaged ({_line(error)})") from None
-
-
 def _tensor(path: Path, array: NDArray[Any]) -> Tensor:
     try:
         return torch.from_numpy(array)
     except TypeError:
         raise InputError(f"{path}: holds {array.dtype}; expected numbers that PyTorch knows") from None
-
-
-def _line(error: BaseException) -> str:
-    """The first line of a library's message."""
-    return (str(error).strip().splitlines() or [type(error).__name__])[0]

@@ -16,7 +16,6 @@ A file space.json or meta.json beside them, {"space": "..."}, names the embeddin
 
 from __future__ import annotations
 
-import json
 import os
 from collections.abc import Sequence
 from pathlib import Path
@@ -26,17 +25,19 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from sgwarp.encoders.base import MissingMap
+from sgwarp.encoders.base import MapSource, MissingMap
+from sgwarp.encoders.building import Request
 from sgwarp.encoders.maps.feature_files import (
     FEATURE_SUFFIXES,
     Layout,
     channels_last,
-    load_array,
     load_features,
     same_shape,
 )
+from sgwarp.encoders.names import Member
 from sgwarp.errors import InputError
-from sgwarp.files.access import read_bytes
+from sgwarp.files.arrays import read_array
+from sgwarp.files.documents import read_json
 from sgwarp.files.images import read_ids
 from sgwarp.io.companions import Companions
 from sgwarp.scene import FeatureMap, View
@@ -130,10 +131,7 @@ class FileMaps:
     def _named_space(self) -> str | None:
         for path in (self.folder / name for name in SPACE_FILES):
             if path.is_file():
-                try:
-                    content = json.loads(read_bytes(path))
-                except ValueError as error:
-                    raise InputError(f"{path}: is not JSON ({error})") from None
+                content = read_json(path)
                 space = content.get("space") if isinstance(content, dict) else None
                 if isinstance(space, str) and space:
                     return space
@@ -184,8 +182,8 @@ class FileMaps:
 
     def _levels(self, path: Path, view: View) -> tuple[Tensor, Tensor]:
         """Ids, int64 [L, h, w], and vectors, float32 [M, C], of a LangSplat pair."""
-        ids = load_array(path)
-        if ids.ndim != 3 or not np.array_equal(ids, np.rint(ids)):
+        ids = read_array(path)
+        if ids.ndim != 3 or not ids.size or ids.dtype.kind not in "biuf" or not np.array_equal(ids, np.rint(ids)):
             raise InputError(f"{path}: expected integer ids [levels, h, w], got {ids.dtype} {list(ids.shape)}")
         for level in self.levels or ():
             if not 0 <= level < len(ids):
@@ -195,7 +193,7 @@ class FileMaps:
         ids = np.moveaxis(self._carried(path, np.moveaxis(ids, 0, 2), view), 2, 0)
         _require_shape(path, ids.shape[1:], view)
         other = path.with_name(path.name.removesuffix("_s.npy") + "_f.npy")
-        vectors = load_array(other)
+        vectors = read_array(other)
         if vectors.ndim != 2 or not np.issubdtype(vectors.dtype, np.floating):
             raise InputError(f"{other}: expected floating point [M, C], got {vectors.dtype} {list(vectors.shape)}")
         if ids.min() < -1 or ids.max() >= len(vectors):
@@ -242,3 +240,8 @@ def open_files(
     if straight not in (None, "yes", "no"):
         raise InputError(f"files:{folder}: straight is yes or no, not '{straight}'")
     return FileMaps(folder, views, layout=layout, levels=chosen, straight=straight == "yes")  # type: ignore[arg-type]
+
+
+def make_source(member: Member, request: Request) -> MapSource:
+    """`open_files` for the views that are asked for."""
+    return open_files(member.source.argument, request.views, **member.source.options)

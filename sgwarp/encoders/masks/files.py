@@ -17,10 +17,12 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from sgwarp.encoders.base import UNRANKED, Masks, MissingMap
-from sgwarp.encoders.maps.feature_files import load_archive
+from sgwarp.encoders.base import UNRANKED, MaskGenerator, Masks, MissingMap
+from sgwarp.encoders.building import Request
+from sgwarp.encoders.names import Part
 from sgwarp.errors import InputError
 from sgwarp.files.access import read_bytes
+from sgwarp.files.arrays import read_arrays
 from sgwarp.files.images import read_ids
 from sgwarp.io.companions import Companions
 from sgwarp.scene import View
@@ -92,7 +94,7 @@ def _from_ids(path: Path, view: View) -> Masks:
 
 
 def _from_stack(path: Path, view: View) -> Masks:
-    arrays = load_archive(path)
+    arrays = read_arrays(path)
     if "masks" not in arrays or arrays["masks"].ndim != 3:
         raise InputError(f"{path}: expected an array masks [M, h, w]")
     count = len(arrays["masks"])
@@ -103,3 +105,8 @@ def _from_stack(path: Path, view: View) -> Masks:
         return Masks(torch.from_numpy(np.ascontiguousarray(np.moveaxis(stack, 2, 0))), scores, ranks)
     except InputError as error:
         raise InputError(f"{path}: {error}") from None
+
+
+def make_masks(part: Part, request: Request) -> MaskGenerator:
+    """Masks from a folder."""
+    return FileMasks(part.argument, request.views)

@@ -15,8 +15,10 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from sgwarp.encoders.base import UNRANKED, Masks
+from sgwarp.encoders.base import UNRANKED, MaskGenerator, Masks
+from sgwarp.encoders.building import Request, own
 from sgwarp.encoders.compose import as_pixels, combine_masks
+from sgwarp.encoders.names import Part
 from sgwarp.errors import InputError
 from sgwarp.scene import View
 
@@ -168,3 +170,8 @@ def _segmentation() -> Any:
     if not hasattr(cv2, "ximgproc"):
         raise InputError("this OpenCV lacks ximgproc; replace it: pip install opencv-contrib-python-headless")
     return cv2.ximgproc.segmentation
+
+
+def make_masks(part: Part, request: Request) -> MaskGenerator:
+    """The generator of OpenCV whose name the part has."""
+    return Proposals(part.kind.name, **own(part, Proposals))  # type: ignore[arg-type]

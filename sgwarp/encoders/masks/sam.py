@@ -14,7 +14,9 @@ import torch
 from torch import Tensor
 from torch.nn.functional import interpolate, pad
 
-from sgwarp.encoders.base import Masks
+from sgwarp.encoders.base import MaskGenerator, Masks
+from sgwarp.encoders.building import Request, levels_of, own
+from sgwarp.encoders.names import Part
 from sgwarp.encoders.regions import mask_boxes
 from sgwarp.encoders.weights import Preparation, channels_first, fitted, identity_of_weights, load_config, load_model
 from sgwarp.errors import InputError
@@ -185,3 +187,9 @@ def best_boxes(boxes: Tensor, overlap: float, groups: Tensor | None = None) -> T
         if kept[number]:
             kept[number + 1 :] &= ~repeats[number, number + 1 :].cpu()
     return kept
+
+
+def make_masks(part: Part, request: Request) -> MaskGenerator:
+    """SAM, SAM 2 or SAM 3, as the files say."""
+    by_rank = levels_of(part) != ("default",)
+    return Sam(part.argument, SamSettings(by_rank=by_rank, **own(part, SamSettings)), request.device)

@@ -7,7 +7,10 @@ from collections.abc import Sequence
 import torch
 from torch import Tensor
 
+from sgwarp.encoders.base import MapSource
+from sgwarp.encoders.building import Request, source_of_pixels
 from sgwarp.encoders.maps.files import LABEL_SPACE
+from sgwarp.encoders.names import Member
 from sgwarp.encoders.prompts import PLAIN, fill_templates
 from sgwarp.encoders.weights import (
     Preparation,
@@ -67,3 +70,10 @@ class ClipSeg:
             shares.append(found.logits.reshape(found.logits.shape[-2:]).sigmoid())
         templates = len(shares) // len(self.labels)
         return torch.stack(shares).unflatten(0, (len(self.labels), templates)).mean(dim=1).permute(1, 2, 0).cpu()
+
+
+def make_source(member: Member, request: Request) -> MapSource:
+    """Shares of the phrases at every pixel."""
+    part = member.source
+    classes, templates = part.options.get("classes", ()), request.templates_of(part)
+    return source_of_pixels(ClipSeg(part.argument, classes, device=request.device, **templates), member.masks, request)

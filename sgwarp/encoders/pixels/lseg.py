@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import pickle
-import zipfile
 from collections.abc import Mapping, Sequence
 from typing import Any
 
@@ -11,11 +9,14 @@ import torch
 from torch import Tensor
 from torch.nn.functional import normalize
 
+from sgwarp.encoders.base import MapSource
+from sgwarp.encoders.building import Request, some, source_of_pixels
+from sgwarp.encoders.names import Member, Part
 from sgwarp.encoders.pixels.lseg_network import LSegNetwork, LSegShape
 from sgwarp.encoders.prompts import PLAIN, Phrases
 from sgwarp.encoders.weights import Preparation, channels_first, fitted, identity_of_weights, load_tokenizer, require
 from sgwarp.errors import InputError
-from sgwarp.files.access import reading
+from sgwarp.files.torch_files import load_torch
 
 TOKENIZER = "openai/clip-vit-base-patch32"  # name on the hub of a model with CLIP's tokenizer
 BEGINNING = "net."  # of the network's parameters in the checkpoint
@@ -103,16 +104,11 @@ def read_checkpoint(path: str) -> dict[str, Tensor]:
     Raises:
         InputError: The file is missing, damaged, or holds no such tensors.
     """
-    with reading(path):
-        try:
-            content = torch.load(path, map_location="cpu", weights_only=True, mmap=zipfile.is_zipfile(path))
-        except (RuntimeError, EOFError, ValueError, KeyError) as error:
-            line = (str(error).splitlines() or [type(error).__name__])[0]
-            raise InputError(f"{path}: is not a checkpoint of PyTorch, or is damaged ({line})") from None
-        except pickle.UnpicklingError:
-            # Lightning keeps its settings beside the weights, as objects of its own; only the tensors are wanted.
-            content = _load_tensors_only(path)
+    # Lightning keeps its settings beside the weights, as objects of its own; they come back inert.
+    content = load_torch(path, mapped=True)
     state = content.get("state_dict", content) if isinstance(content, Mapping) else {}
+    if not isinstance(state, Mapping):
+        state = {}
     weights = {
         name[len(BEGINNING) :]: value
         for name, value in state.items()
@@ -121,47 +117,6 @@ def read_checkpoint(path: str) -> dict[str, Tensor]:
     if not weights:
         raise InputError(f"{path}: holds no parameters named {BEGINNING}*; give LSeg's demo_e200.ckpt")
     return weights
-
-
-class _Inert:
-    """Stands for every class in a checkpoint that is no tensor: it can be made and filled, and does nothing."""
-
-    def __init__(self, *arguments: Any, **named: Any) -> None: ...
-
-    def __setstate__(self, state: Any) -> None: ...
-
-    def __setitem__(self, key: Any, value: Any) -> None: ...
-
-
-class _TensorsOnly(pickle.Unpickler):
-    ALLOWED = ("torch", "torch._utils", "torch.storage", "collections")
-
-    def find_class(self, module: str, name: str) -> Any:
-        if module == "collections" and name == "OrderedDict":
-            return super().find_class(module, name)
-        if module in self.ALLOWED and (name.startswith("_rebuild_") or name.endswith("Storage")):
-            return super().find_class(module, name)
-        return _Inert
-
-
-class _TensorPickle:
-    """Replacement of the pickle module for torch.load."""
-
-    Unpickler = _TensorsOnly
-    __name__ = "tensors only"
-
-    @staticmethod
-    def load(file: Any, **named: Any) -> Any:
-        return _TensorsOnly(file, **named).load()
-
-
-def _load_tensors_only(path: str) -> Any:
-    """A checkpoint with everything but its tensors and dictionaries made inert; no code of the file runs."""
-    try:
-        return torch.load(path, map_location="cpu", weights_only=False, pickle_module=_TensorPickle)
-    except Exception as error:
-        line = (str(error).splitlines() or [type(error).__name__])[0]
-        raise InputError(f"{path}: is not a checkpoint of PyTorch, or is damaged ({line})") from None
 
 
 def load_network(path: str, weights: Mapping[str, Tensor]) -> LSegNetwork:
@@ -247,3 +202,14 @@ def _as_transformers(weights: Mapping[str, Tensor], layers: int) -> dict[str, Te
             for letter, third in zip("qkv", thirds, strict=True):
                 named[f"{new}self_attn.{letter}_proj.{kind}"] = third
     return named
+
+
+def make_source(member: Member, request: Request) -> MapSource:
+    """Features of every pixel."""
+    return source_of_pixels(make_text(member.source, request), member.masks, request)
+
+
+def make_text(part: Part, request: Request) -> LSeg:
+    """Image and text side are one network."""
+    options = some(part, "longest", "tokenizer") | request.templates_of(part)
+    return LSeg(part.argument, device=request.device, **options)

@@ -17,8 +17,10 @@ import torch
 from torch import Tensor
 from torch.nn.functional import normalize
 
-from sgwarp.encoders.base import TextEncoder
+from sgwarp.encoders.base import MapSource, TextEncoder
+from sgwarp.encoders.building import Request, source_of_pixels
 from sgwarp.encoders.compose import as_pixels
+from sgwarp.encoders.names import Member
 from sgwarp.encoders.weights import require
 from sgwarp.errors import InputError
 
@@ -102,3 +104,10 @@ def _hash_of(folder: Path) -> str:
             with open(path, "rb") as file:
                 digest.update(file.read(1 << 20))
     return digest.hexdigest()[:12]
+
+
+def make_source(member: Member, request: Request) -> MapSource:
+    """Features of every pixel, in the space of the text side that is named beside it."""
+    part = member.source
+    encoder = OpenSeg(part.argument, request.text(member), part.options.get("pooled", True))
+    return source_of_pixels(encoder, member.masks, request)

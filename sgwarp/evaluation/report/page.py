@@ -114,7 +114,7 @@ def write_page(findings: Findings, path: Path) -> None:
             _lifting_table(findings.lifting),
         ]
     if findings.stability:
-        parts += ["## Stability", *_stability(findings.stability)]
+        parts += ["## Stability", *_stability(findings.stability, findings.about["device"])]
     with atomic_path(path) as temporary:
         temporary.write_text("\n\n".join(parts) + "\n", encoding="utf-8")
 
@@ -157,7 +157,7 @@ def _lifting_table(trials: Sequence[Trial]) -> str:
     return _table(columns, rows, text=2)
 
 
-def _stability(results: Sequence[Stability]) -> list[str]:
+def _stability(results: Sequence[Stability], device: str) -> list[str]:
     """One row per extreme scene: the worse of its schedules."""
     by_name: dict[str, list[Stability]] = {}
     for result in results:
@@ -184,9 +184,10 @@ def _stability(results: Sequence[Stability]) -> list[str]:
         )
     columns = ["scene", "Gaussians", "error", "bound", "gradient error", "bound", "undecidable", "culled", "how"]
     passed = sum(all(result.within for result in group) for group in by_name.values())
+    both = "the schedule of CPUs (lanes) and in that of GPUs (blocks, on fibers); the worse of the two is shown"
     return [
         f"{passed} of {len(by_name)} extreme scenes are finite and within their bounds against the float64 oracle, in "
-        "the schedule of CPUs (lanes) and in that of GPUs (blocks, on fibers); the worse of the two is shown. Errors "
+        f"{both if device == 'CPU' else f'the schedule of GPUs on {device}'}. Errors "
         "are the largest of colour and opacity; gradients are those of a random weighting of the image with respect to "
         "means, rotations, scales, opacities, colours and the camera's rotation and translation, each relative to its "
         "largest entry. Pixels are undecidable in float32, and left out, where an alpha or transmittance lies within "

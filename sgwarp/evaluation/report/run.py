@@ -5,13 +5,15 @@ from __future__ import annotations
 from collections.abc import Sequence
 from pathlib import Path
 
+import torch
+
 from sgwarp.encoders.maps.files import FileMaps
 from sgwarp.errors import InputError
 from sgwarp.evaluation.report.extremes import EXTREMES
 from sgwarp.evaluation.report.oracle import LIMIT, SAME, SIDE, see_patches
 from sgwarp.evaluation.report.page import PLOT, Findings, Stability, write_json, write_page
 from sgwarp.evaluation.report.plot import draw_trials, require_matplotlib
-from sgwarp.evaluation.report.stability import check, check_gradients
+from sgwarp.evaluation.report.stability import Schedule, check, check_gradients
 from sgwarp.evaluation.report.sweep import Trial, rendering_variants, sweep_lifting, sweep_rendering
 from sgwarp.ops.launcher import get_threads
 from sgwarp.runs.log import RunLog
@@ -106,7 +108,7 @@ def make_report(
     }
     findings = Findings(about, rounding, rendering, lifting)
     with log.stage("extremes"):
-        findings.stability = check_extremes(extremes)
+        findings.stability = check_extremes(extremes, gaussians.device)
 
     log.error |= {f"default_{key}": value for key, value in rendering[0].errors.items()}
     log.error["rounding"] = rounding
@@ -122,17 +124,19 @@ def make_report(
     return findings
 
 
-def check_extremes(names: Sequence[str]) -> list[Stability]:
-    """Images and gradients of the extreme scenes in both schedules, on the CPU."""
+def check_extremes(names: Sequence[str], device: torch.device | str = "cpu") -> list[Stability]:
+    """Images and gradients of the extreme scenes: on the CPU in both schedules, elsewhere in that of the device."""
     results = []
+    schedules: tuple[Schedule, ...] = ("lanes", "block") if torch.device(device).type == "cpu" else ("block",)
     with show_progress("extremes") as progress:
         progress(0, len(names), "")
         for done, name in enumerate(names, start=1):
             extreme = EXTREMES[name]
             count = len(extreme.build()[0])
-            for schedule in ("lanes", "block"):
-                gradient = None if extreme.gradient_bound is None else check_gradients(extreme, schedule)
-                results.append(Stability(extreme, schedule, count, check(extreme, schedule), gradient))
+            for schedule in schedules:
+                bounded = extreme.gradient_bound is not None
+                gradient = check_gradients(extreme, schedule, device) if bounded else None
+                results.append(Stability(extreme, schedule, count, check(extreme, schedule, device), gradient))
             progress(done, len(names), name)
     return results
 

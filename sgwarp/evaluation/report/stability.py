@@ -65,12 +65,13 @@ class GradientResult:
         return float(torch.tensor(list(self.errors.values())).max())  # NaN, if there is one
 
 
-def check(extreme: Extreme, schedule: Schedule = "lanes") -> ImageResult:
-    """Render an extreme scene and compare it with the oracle."""
+def check(extreme: Extreme, schedule: Schedule = "lanes", device: torch.device | str = "cpu") -> ImageResult:
+    """Render an extreme scene on a device and compare it with the oracle."""
     gaussians, camera = extreme.build()
-    _render(gaussians, camera, schedule)  # compiles
+    there = gaussians.to(device)
+    _render(there, camera, schedule)  # compiles
     start = time.perf_counter()
-    image, alpha, mean_depth, surface, culled = _render(gaussians, camera, schedule)
+    image, alpha, mean_depth, surface, culled = _render(there, camera, schedule)
     seconds = time.perf_counter() - start
     expected = reference.rasterize(gaussians, camera)
     decided = decidable(expected)
@@ -87,7 +88,9 @@ def check(extreme: Extreme, schedule: Schedule = "lanes") -> ImageResult:
     )
 
 
-def check_gradients(extreme: Extreme, schedule: Schedule = "lanes") -> GradientResult:
+def check_gradients(
+    extreme: Extreme, schedule: Schedule = "lanes", device: torch.device | str = "cpu"
+) -> GradientResult:
     """Backpropagate random weights on the decidable pixels, and compare with float64 autograd of the oracle."""
     gaussians, camera = extreme.build()
     kept = gaussians.finite
@@ -97,7 +100,7 @@ def check_gradients(extreme: Extreme, schedule: Schedule = "lanes") -> GradientR
     rng = torch.Generator().manual_seed(0)
     weights = torch.randn(*camera.size, 4, generator=rng) * decidable(expected)[..., None]
     (torch.cat([expected.features, expected.alpha[..., None]], dim=2) * weights).sum().backward()
-    mine = {name: getattr(gaussians, name).clone().requires_grad_() for name in FIELDS}
+    mine = {name: getattr(gaussians, name).to(device).clone().requires_grad_() for name in FIELDS}
     got = rasterize(
         mine["means"],
         mine["quats"],
@@ -112,13 +115,14 @@ def check_gradients(extreme: Extreme, schedule: Schedule = "lanes") -> GradientR
         far=camera.far,
         schedule=schedule,
     )
-    (torch.cat([got.features, got.alpha[..., None]], dim=2) * weights).sum().backward()
+    (torch.cat([got.features, got.alpha[..., None]], dim=2) * weights.to(device)).sum().backward()
     got_pose, wanted_pose = _pose_parts(my_pose, camera), _pose_parts(their_pose, camera)
     errors = {part: _relative(got_pose[part] - wanted_pose[part], wanted_pose[part]) for part in POSE}
     finite = all(bool(torch.isfinite(part).all()) for part in got_pose.values())
     for name in FIELDS:
         grad, wanted = mine[name].grad, theirs[name].grad
         assert grad is not None
+        grad = grad.cpu()
         assert wanted is not None
         finite &= bool(torch.isfinite(grad).all())
         error = torch.cat([(grad[kept] - wanted).flatten(), grad[~kept].double().flatten()])
@@ -129,12 +133,13 @@ def check_gradients(extreme: Extreme, schedule: Schedule = "lanes") -> GradientR
 def _render(
     gaussians: Gaussians, camera: Camera, schedule: Schedule
 ) -> tuple[Tensor, Tensor, Tensor, Tensor, dict[str, int]]:
-    """Colour, opacity, expected and surface depth, and what was culled; `rasterize` in a given schedule."""
+    """Colour, opacity, expected and surface depth on the CPU, and what was culled; `rasterize` in a given schedule."""
     settings = RasterSettings()
     projected = tiles.project(gaussians, camera, settings)
     order = tiles.depth_order(projected)
     lists = tiles.bin_splats(projected, order, tiles.shade(gaussians, camera, order, gaussians.sh_degree), camera)
     image, transmittance, depth_sum, surface = composite(lists, camera, settings, None, True, schedule)
+    image, transmittance, depth_sum, surface = (t.cpu() for t in (image, transmittance, depth_sum, surface))
     alpha = 1.0 - transmittance
     return image, alpha, depth_sum / alpha.clamp(min=1e-12), surface, tiles.culled(projected.counts())
 

@@ -11,6 +11,8 @@ import torch
 import torch.distributed as dist
 from torch import Tensor
 
+from sgwarp.errors import InputError
+
 
 @dataclass(frozen=True)
 class Processes:
@@ -37,10 +39,16 @@ class Processes:
 
 @contextmanager
 def joined(device: str) -> Iterator[Processes]:
-    """The processes that torchrun started, or this one alone."""
+    """The processes that torchrun started, or this one alone.
+
+    Raises:
+        InputError: There are several, and the device is one of them all.
+    """
     if int(os.environ.get("WORLD_SIZE", "1")) == 1:
         yield Processes()
         return
+    if device.startswith("cuda:"):
+        raise InputError(f"device {device}: several processes take one device each; name plain cuda")
     if device == "cuda":
         torch.cuda.set_device(int(os.environ["LOCAL_RANK"]))
     dist.init_process_group("nccl" if device == "cuda" else "gloo")

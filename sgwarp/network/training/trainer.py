@@ -9,7 +9,6 @@ from __future__ import annotations
 import hashlib
 import math
 import os
-import pickle
 import time
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass, field
@@ -20,8 +19,7 @@ import torch
 from torch import Tensor
 
 from sgwarp.errors import InputError
-from sgwarp.files.access import reading
-from sgwarp.files.atomic import atomic_path
+from sgwarp.files.torch_files import load_torch, save_torch
 from sgwarp.metrics.segmentation import ConfusionMatrix
 from sgwarp.network.checkpoint import load_into, read_weights
 from sgwarp.network.inputs import INPUT_CHANNELS
@@ -31,11 +29,13 @@ from sgwarp.network.semantic_network import SemanticNetwork
 from sgwarp.network.training.data import CHUNK, Example, TrainingScene, make_example
 from sgwarp.network.training.processes import Processes
 from sgwarp.network.training.settings import DistillSettings, Epoch
+from sgwarp.runs.isolation import isolated
 from sgwarp.runs.log import RunLog
 from sgwarp.runs.progress import Report
 from sgwarp.scene import Semantics
 
 
+@isolated
 def distill(
     scenes: Sequence[TrainingScene],
     settings: DistillSettings | None = None,
@@ -290,8 +290,7 @@ class _Run:
             "optimizer": self.optimizer.state_dict(),
             "history": [asdict(epoch) for epoch in self.history],
         }
-        with atomic_path(path) as temporary:
-            torch.save(content, temporary)
+        save_torch(path, content)
 
     def restore(self, path: Path) -> None:
         """Go on where `save` left off.
@@ -300,8 +299,7 @@ class _Run:
             InputError: The file is no such state, or was written with other settings.
         """
         try:
-            with reading(path):
-                content = torch.load(path, map_location="cpu", weights_only=True)
+            content = load_torch(path)
             stored: dict[str, Any] = content["settings"]
             mine = self._signature()
             changed = [name for name in mine if mine[name] != stored.get(name)]
@@ -315,7 +313,7 @@ class _Run:
             self.history = [Epoch(**epoch) for epoch in content["history"]]
         except InputError:
             raise
-        except (KeyError, TypeError, ValueError, RuntimeError, EOFError, pickle.UnpicklingError) as error:
+        except (KeyError, TypeError, ValueError, RuntimeError, AttributeError, IndexError) as error:
             raise InputError(f"{path}: is no training state, or damaged ({type(error).__name__}); remove it") from None
         self.log.leave_out("epochs_done_before", len(self.history))
 

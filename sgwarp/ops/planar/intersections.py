@@ -10,10 +10,10 @@ import warp as wp
 from torch import Tensor
 
 from sgwarp.errors import InputError
-from sgwarp.ops.launcher import view
+from sgwarp.ops.launcher import sort_pairs
 
 DEPTH_BITS = 32
-MAX_INTERSECTIONS = 2**31 - 1
+MAX_INTERSECTIONS = 2**30 - 1  # the sort takes twice the room, and Warp counts in int32
 
 
 def tile_bits(tile_columns: int, tile_rows: int) -> int:
@@ -66,7 +66,7 @@ def intersect_boxes(
         counts = size.prod(1)
         total = int(counts.sum())
         if total > MAX_INTERSECTIONS:
-            raise InputError(f"{total} tile intersections exceed 2^31 - 1; render at a lower resolution")
+            raise InputError(f"{total} tile intersections exceed {MAX_INTERSECTIONS}; render at a lower resolution")
         rows = torch.repeat_interleave(torch.arange(len(counts), device=counts.device), counts, output_size=total)
         within = torch.arange(total, device=counts.device) - (counts.cumsum(0) - counts)[rows]
         across = size[rows, 0]
@@ -76,7 +76,7 @@ def intersect_boxes(
         listed = rows.to(torch.int32)
         if sort and total:
             keys, listed = (torch.cat([t, torch.empty_like(t)]) for t in (keys, listed))
-            wp.utils.radix_sort_pairs(view(keys, wp.int64), view(listed, wp.int32), total)
+            sort_pairs(keys, listed, total, wp.int64)
             keys, listed = keys[:total].clone(), listed[:total].clone()
         return counts.to(torch.int32), keys, listed
 

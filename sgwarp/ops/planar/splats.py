@@ -131,6 +131,7 @@ class _CompositeSplats(torch.autograd.Function):
         camera, settings = _frame(job.width, job.height), job.settings
         projected = _as_splats(means2d, factors, opacities, depths, settings)
         values = features.detach().to(torch.float32).contiguous()
+        tiles.leave_out_non_finite(projected, values)
         if job.given is not None:
             lists = _follow(job.given, projected, values, camera)
         else:
@@ -194,7 +195,7 @@ def _splat_gradients(sums: Tensor, factors: Tensor, opacities: Tensor) -> tuple[
 @lru_cache(maxsize=32)
 def _frame(width: int, height: int) -> Camera:
     """An image's size in the form that binning and compositing read it."""
-    return Camera(torch.eye(3), torch.eye(4), width, height)
+    return Camera(torch.eye(3, device="cpu"), torch.eye(4, device="cpu"), width, height)
 
 
 def _padded(values: Tensor) -> Tensor:

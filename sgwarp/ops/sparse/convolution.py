@@ -86,7 +86,7 @@ def _fits_kernel(features: Tensor, outputs: int) -> bool:
 
 def _pairs(kernel_map: KernelMap) -> list[Any]:
     """Pairs as the kernels read them."""
-    starts = view(torch.tensor(kernel_map.starts, dtype=torch.int32), wp.int32)
+    starts = view(torch.tensor(kernel_map.starts, dtype=torch.int32, device="cpu"), wp.int32)
     identity = -1 if kernel_map.identity is None else kernel_map.identity
     return [view(kernel_map.sources, wp.int64), view(kernel_map.targets, wp.int64), starts, identity]
 

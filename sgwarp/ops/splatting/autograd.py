@@ -15,6 +15,7 @@ from sgwarp.ops.splatting.forward import Rendering, composite_recorded, packed_c
 from sgwarp.ops.splatting.plan import RenderPlan, plan_render
 from sgwarp.ops.splatting.settings import RasterSettings
 from sgwarp.scene import SH_COUNTS, Camera, Gaussians
+from sgwarp.scene.checks import dense
 
 
 def rasterize(
@@ -74,6 +75,21 @@ def rasterize(
         InputError: Shapes do not fit, or the camera is not valid; on the CPU also: a scale is negative or an opacity
             outside [0, 1].
     """
+    means, quats, scales, opacities, viewmat = (
+        dense(name, value)
+        for name, value in zip(
+            ("means", "quats", "scales", "opacities", "viewmat"),
+            (means, quats, scales, opacities, viewmat),
+            strict=True,
+        )
+    )
+    K = dense("K", K)
+    if means.ndim != 2:
+        raise InputError(f"means: expected floating point [N, 3], got {means.dtype} {list(means.shape)}")
+    sh, features, background, means2d = (
+        None if value is None else dense(name, value)
+        for name, value in (("sh", sh), ("features", features), ("background", background), ("means2d", means2d))
+    )
     if sh is None and features is None:
         raise InputError("give sh [N, K, 3], features [N, C], or both")
     if means2d is not None and tuple(means2d.shape) != (len(means), 2):
@@ -85,6 +101,8 @@ def rasterize(
     n = len(means)
     if schedule not in (None, "lanes", "block"):
         raise InputError(f"schedule: expected 'lanes', 'block' or None, got '{schedule}'")
+    if schedule == "lanes" and means.is_cuda:
+        raise InputError("schedule 'lanes': is for tensors of the CPU; leave it out on CUDA")
     if features is not None:
         if not (features.ndim == 2 and len(features) == n and features.shape[1] > 0 and features.is_floating_point()):
             raise InputError(f"features: expected floating point [{n}, C], got {features.dtype} {list(features.shape)}")
@@ -103,15 +121,15 @@ def rasterize(
     inputs = (means, quats, scales, opacities, values, viewmat, means2d, background)
     if not (torch.is_grad_enabled() and any(t is not None and t.requires_grad for t in inputs)):
         colors = means.new_zeros(n, 1, 3) if sh is None else sh
-        gaussians = Gaussians(means, quats, scales, opacities, colors)
         return forward.rasterize(
-            gaussians,
+            _as_gaussians(means, quats, scales, opacities, colors),
             camera,
             features,
             background=background,
             expected_depth=expected_depth,
             depth=depth,
             settings=settings,
+            look=not means.is_cuda,
         )
     receives_absgrad = means2d if absgrad else None
     plan = plan_render(
@@ -147,6 +165,13 @@ def _colors(means: Tensor, sh: Tensor, viewmat: Tensor) -> Tensor:
     return torch.nan_to_num((harmonics_sum(directions, sh.to(means), degree) + 0.5).clamp(min=0.0), posinf=0.0)
 
 
+def _as_gaussians(*fields: Tensor) -> Gaussians:
+    """The tensors as a scene; on CUDA unchecked, since to look at their values is to wait for the device."""
+    if not fields[0].is_cuda:
+        return Gaussians(*fields)
+    return Gaussians.unchecked(*(field.to(torch.float32).contiguous() for field in fields))
+
+
 def _check_fields(means: Tensor, quats: Tensor, scales: Tensor, opacities: Tensor) -> None:
     """Shapes and types always; values on the CPU only, since on CUDA to look at them is to wait for the device."""
     n = len(means)
@@ -173,7 +198,7 @@ class _Request:
     receives_absgrad: Tensor | None
     schedule: str | None
     deterministic: bool | None
-    status_counts: Tensor = field(default_factory=lambda: torch.empty(0, dtype=torch.int64))
+    status_counts: Tensor = field(default_factory=lambda: torch.empty(0, dtype=torch.int64, device="cpu"))
 
     @property
     def harmonics(self) -> bool:
@@ -200,6 +225,7 @@ class _Rasterize(torch.autograd.Function):
         gaussians = _gaussians(means, quats, scales, opacities, values, request)
         features = None if request.harmonics else values
         projected = tiles.project(gaussians, camera, settings)
+        tiles.leave_out_non_finite(projected, features)
         order = tiles.depth_order(projected)
         colors = packed_colors(gaussians, camera, features, order, request.plan)
         lists = tiles.bin_splats(projected, order, colors, camera, places=True, keep=True)

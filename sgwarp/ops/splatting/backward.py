@@ -119,17 +119,20 @@ def composite_backward(
     together = wide and not block and slices.shape[1] <= TOGETHER
     shape = (lists.intersections, slices.shape[1], LANE) if together else (0, 0, LANE)
     feature_rows = scratch("feature rows", math.prod(shape), torch.float32, device).view(shape)
+    pixels = in_slices(v_image if wide else zeros[:0, :0, None])
     head = lists.arrays()
     size = [tiles.knobs(settings), camera.width, camera.height]
     if block:
-        maps = [view(t.contiguous(), wp.float32) for t in (transmittance, v_transmittance, v_image, v_depth)]
-        inputs = [*head, view(slices, Lanes), *maps, view(last, wp.int32), *size]
+        images = [view(t.contiguous(), wp.float32) for t in (transmittance, v_transmittance, v_image)]
+        by_four = (view(t.flatten(-2).unflatten(-1, (-1, 4)), wp.vec4) for t in (slices, pixels))
+        features_by_four, v_features = by_four
+        inputs = [*head, features_by_four, *images, v_features, view(v_depth.contiguous(), wp.float32)]
+        inputs += [view(last, wp.int32), *size]
         kernel = compositing_block_backward.make_composite_backward_block(wide, depth, absolute, ordered)
         outputs = [view(rows if ordered else sums, wp.float32)]
         launch_blocks(kernel, [lists.tile_count], inputs, outputs, device=device)
     else:
         columns = -(-camera.width // LANE)
-        pixels = in_slices(v_image if wide else zeros[:0, :0, None])
         if wide:
             gradient = lane_scratch("backward gradient", TILE_ROWS, slices.shape[1] * LANE, device)
         else:

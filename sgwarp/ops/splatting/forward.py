@@ -14,7 +14,7 @@ from sgwarp.kernels.compositing import lanes as compositing_lanes
 from sgwarp.kernels.compositing import lanes_features as compositing_lanes_features
 from sgwarp.kernels.native import BATCH, Seen
 from sgwarp.kernels.transmittance import Lanes
-from sgwarp.ops.launcher import fresh, get_threads, launch, launch_blocks, scratch, view
+from sgwarp.ops.launcher import fresh, get_threads, launch, launch_blocks, scratch, view, warp_device
 from sgwarp.ops.splatting import tiles
 from sgwarp.ops.splatting.plan import RenderPlan, Values, plan_render
 from sgwarp.ops.splatting.settings import RasterSettings
@@ -59,6 +59,7 @@ def rasterize(
     depth: bool = False,
     settings: RasterSettings = RasterSettings(),  # noqa: B008 - frozen
     plan: RenderPlan | None = None,
+    look: bool = True,
 ) -> Rendering:
     """Render a view (paper eq. 1): project, order by (depth, index), list per tile, composite front to back.
 
@@ -70,6 +71,7 @@ def rasterize(
         expected_depth, depth: Which depths to render; without them nothing is computed for them.
         settings: The approximations.
         plan: What to compute, and what not; derived from the scene and the request if None.
+        look: Look which harmonics the scene uses, where the plan is derived; on CUDA that waits, once per scene.
 
     Raises:
         InputError: `features` or `background` do not fit.
@@ -87,8 +89,9 @@ def rasterize(
     if plan is None:
         values: Values = "colors" if features is None else "features"
         wants_depth = expected_depth or depth
-        plan = plan_render(gaussians, values, channels=channels, depth=wants_depth, settings=settings)
+        plan = plan_render(gaussians, values, channels=channels, depth=wants_depth, settings=settings, look=look)
     projected = tiles.project(gaussians, camera, settings)
+    tiles.leave_out_non_finite(projected, features)
     order = tiles.depth_order(projected)
     colors = packed_colors(gaussians, camera, features, order, plan)
     lists = tiles.bin_splats(projected, order, colors, camera)
@@ -103,7 +106,8 @@ def rasterize(
 
 
 def require_finite(features: Tensor) -> None:
-    """Refuse NaN and infinity, on the CPU; on CUDA to look at the values is to wait for the device.
+    """Refuse NaN and infinity, on the CPU. On CUDA to look at the values is to wait for the device: there their
+    Gaussians are left out (`tiles.leave_out_non_finite`).
 
     Raises:
         InputError: Some feature is not finite; it would reach pixels far from its Gaussian, as zero times infinity.
@@ -228,7 +232,7 @@ def batch_scratch(device: torch.device) -> list[wp.array]:
     size = wp.types.type_size_in_bytes(Seen)
     memory = scratch("lanes batch", threads * batch * size // 4, torch.int32, device)
     layout = {"dtype": Seen, "shape": (threads, batch), "capacity": 4 * len(memory)}
-    seen: wp.array = wp.array(ptr=memory.data_ptr(), device=wp.device_from_torch(device), **layout)
+    seen: wp.array = wp.array(ptr=memory.data_ptr(), device=warp_device(device), **layout)
     reached = scratch("lanes reached", threads * TILE_ROWS, torch.int32, device).view(threads, TILE_ROWS)
     return [seen, view(reached, wp.int32)]
 

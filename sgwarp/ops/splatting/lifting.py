@@ -137,11 +137,15 @@ def _add_dense(
     total_slices = sums.slices.shape[1]
     # A pass of four slices shares one walk over the tiles; with very many intersections its rows must stay small.
     affordable = max(1, ROW_BYTES // max(1, 64 * lists.intersections))
+    if block and not ordered:
+        affordable = total_slices  # writes no rows
     if not _ready(feature_map, camera, device):  # a slice and its copy in the order of the kernel
         affordable = min(affordable, SLICE_BYTES // (2 * 64 * camera.height * camera.width))
     first = 0
     while first < total_slices:
         count = WIDE if total_slices - first >= WIDE and affordable >= WIDE else 1
+        if block:
+            count = min(total_slices - first, max(affordable, 1))
         features, first_feature = _slices_at_image_size(feature_map, camera, first, count, device)
         place = (first_feature, first, count)
         _add_dense_pass(lists, camera, features, valid, place, sums, settings, block, ordered)
@@ -164,29 +168,34 @@ def _add_dense_pass(
     height, width = camera.size
     total = lists.intersections
     first_feature, first, count = place
-    common = [*lists.arrays(), view(features, Lanes)]
     knobs = tiles.knobs(settings)
     rows = scratch("rows", total * count * LANE if ordered else 0, torch.float32, device).view(-1, count, LANE)
     weights = scratch("entry weights", total if ordered else 0, torch.float32, device)
-    if block and not ordered:
-        view_weights = torch.zeros_like(sums.weight)
-        kernel = lifting_block.make_lift_dense_block(False)
-        outputs = [view(sums.slices.flatten(1), wp.float32), view(view_weights, wp.float32)]
-        inputs = [*common, view(valid, wp.float32), first_feature, first, knobs, width, height]
-        launch_blocks(kernel, [lists.tile_count, count], inputs, outputs, device=device)
-        if first == 0:
-            _fold(view_weights, sums)
-        return
     if block:
-        kernel = lifting_block.make_lift_dense_block(True)
-        outputs = [view(rows.flatten(1), wp.float32), view(weights, wp.float32)]
-        inputs = [*common, view(valid, wp.float32), first_feature, first, knobs, width, height]
-        launch_blocks(kernel, [lists.tile_count, count], inputs, outputs, device=device)
+        target, of_fragments = (rows, weights) if ordered else (sums.slices, torch.zeros_like(sums.weight))
+        inputs = [*lists.arrays(), view(features.flatten(2), wp.float32), view(valid, wp.float32)]
+        inputs += [LANE * first_feature, LANE * first, LANE * count, knobs, width, height]
+        outputs = [view(target.flatten(1), wp.float32), view(of_fragments, wp.float32)]
+        grid = [lists.tile_count, -(-LANE * count // lifting_block.CHANNELS)]
+        launch_blocks(lifting_block.make_lift_dense_block(ordered), grid, inputs, outputs, device=device)
+        if not ordered:
+            if first == 0:
+                _fold(of_fragments, sums)
+            return
     else:
         columns = -(-width // LANE)
         lanes = torch.nn.functional.pad(valid, (0, columns * LANE - width)).view(height, columns, 1, LANE)
         state = lane_scratch("state", TILE_ROWS, 1, device)
-        inputs = [*common, view(lanes, Lanes), first_feature, knobs, width, height, state]
+        inputs = [
+            *lists.arrays(),
+            view(features, Lanes),
+            view(lanes, Lanes),
+            first_feature,
+            knobs,
+            width,
+            height,
+            state,
+        ]
         outputs = [view(rows, Lanes), view(weights, wp.float32)]
         kernel = lifting_lanes.make_lift_dense(count)
         launch(kernel, lists.tile_count, inputs, outputs, device=device, slots=True)
@@ -266,7 +275,9 @@ def _add_ids(
     local_ids = scratch("local ids", count * 256, torch.int32, device).view(count, TILE_ROWS, LANE)
     uniform = scratch("uniform rows", count * TILE_ROWS, torch.int32, device).view(count, TILE_ROWS)
     outputs = [view(tile_ids, wp.int32), view(id_counts, wp.int32), view(local_ids, LaneIds), view(uniform, wp.int32)]
-    launch(lifting.localize_ids, count, [view(ids, wp.int32), width, height], outputs, device=device)
+    every_tile = view(torch.empty(0, dtype=torch.int32, device=device), wp.int32)
+    inputs = [every_tile, view(ids, wp.int32), width, height]
+    launch(lifting.localize_ids, count, inputs, outputs, device=device)
     row_starts = torch.zeros(count + 1, dtype=torch.int32, device=device)
     row_starts[1:] = ((lists.offsets[1:] - lists.offsets[:-1]) * id_counts).cumsum(0)
 
@@ -290,27 +301,30 @@ def _add_ids(
         weights = scratch("id entry weights", int(row_starts[-1]), torch.float32, device).zero_()
         starts = scratch("id entry starts", lists.intersections, torch.int32, device)
     if block:
-        labels = [view(local_ids, wp.int32), view(tile_ids, wp.int32), view(id_counts, wp.int32)]
+        labels = [view(t, wp.int32) for t in (local_ids, uniform, tile_ids, id_counts)]
         outputs = [*(view(t, wp.float32) for t in (id_weights, view_weights, weights)), view(starts, wp.int32)]
         kernel = lifting_block.make_lift_ids_block(ordered)
         launch_blocks(kernel, [count], [*common, *labels, row_places, knobs, width, height], outputs, device=device)
     else:
         state = lane_scratch("state", TILE_ROWS, 1, device)
-        inputs = [*common, view(local_ids, LaneIds), view(uniform, wp.int32), row_places, knobs, width, height, state]
+        labels = [view(local_ids, LaneIds), view(uniform, wp.int32)]
+        inputs = [every_tile, *common, *labels, row_places, knobs, width, height, state]
         outputs = [view(weights, wp.float32), view(starts, wp.int32)]
         launch(lifting_lanes.lift_ids, count, inputs, outputs, device=device, slots=True)
-    order = view(lists.order, wp.int32)
+    vectors = None if feature_map.vectors is None else in_slices(feature_map.vectors.to(device))
     if atomic:
         _fold(view_weights, sums)
-        order = view(torch.arange(len(sums.weight), dtype=torch.int32, device=device), wp.int32)
-        visible = len(sums.weight)
-    else:
-        where = [view(t, wp.int32) for t in (lists.entries, lists.places, starts, lists.tiles)]
-        names = [view(tile_ids, wp.int32), view(id_counts, wp.int32), view(weights, wp.float32)]
-        outputs = [view(t, wp.float32) for t in (id_weights, sums.weight, sums.weight_squared)]
-        launch(lifting.sum_id_weights, visible, [order, *where, *names, int(one_hot)], outputs, device=device)
-    if feature_map.vectors is not None:
-        vectors = in_slices(feature_map.vectors.to(device))
+        if vectors is not None:
+            inputs = [view(t, wp.float32) for t in (id_weights, vectors.flatten(1))]
+            outputs = [view(sums.slices.flatten(1), wp.float32)]
+            launch_plain(lifting_block.add_id_channels, 32 * len(sums.weight), inputs, outputs, device=device)
+        return
+    order = view(lists.order, wp.int32)
+    where = [view(t, wp.int32) for t in (lists.entries, lists.places, starts, lists.tiles)]
+    names = [view(tile_ids, wp.int32), view(id_counts, wp.int32), view(weights, wp.float32)]
+    outputs = [view(t, wp.float32) for t in (id_weights, sums.weight, sums.weight_squared)]
+    launch(lifting.sum_id_weights, visible, [order, *where, *names, int(one_hot)], outputs, device=device)
+    if vectors is not None:
         inputs = [order, view(id_weights, wp.float32), view(vectors, Lanes)]
         launch(lifting.add_id_features, visible, inputs, [view(sums.slices, Lanes)], device=device)
 

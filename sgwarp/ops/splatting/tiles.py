@@ -15,13 +15,14 @@ from sgwarp.kernels.gaussian import Pinhole, Splat
 from sgwarp.kernels.harmonics import forward as harmonics
 from sgwarp.kernels.projection import forward as projection
 from sgwarp.kernels.projection import lanes as projection_lanes
-from sgwarp.ops.launcher import launch, launch_plain, scratch, view
+from sgwarp.ops.launcher import launch, launch_plain, scratch, sort_pairs, view, warp_device
 from sgwarp.ops.splatting.settings import RasterSettings
 from sgwarp.scene import Camera, Gaussians
 
 TILE = 16
 SLICES = 16  # of the depth order, counted and filled independently; not the number of threads
 MAX_INTERSECTIONS = 2**31 - 1
+MAX_SORTED = 2**30 - 1  # a sort takes twice the room, and Warp counts in int32
 
 
 @dataclass(frozen=True)
@@ -98,7 +99,7 @@ def as_splats(memory: Tensor) -> wp.array:
     """The memory as an array of splats; it must outlive the array."""
     count = len(memory) // SPLAT_WORDS
     layout = {"dtype": Splat, "shape": (count,), "capacity": 4 * len(memory)}
-    splats: wp.array = wp.array(ptr=memory.data_ptr(), device=wp.device_from_torch(memory.device), **layout)
+    splats: wp.array = wp.array(ptr=memory.data_ptr(), device=warp_device(memory.device), **layout)
     return splats
 
 
@@ -155,9 +156,24 @@ def project(gaussians: Gaussians, camera: Camera, settings: RasterSettings) -> P
     else:
         launch(projection_lanes.project_groups, -(-n // projection_lanes.GROUP), inputs, outputs, device=device)
     # The kernel reads geometry and opacity only. On CUDA it is cheaper to look at all than to wait for the answer.
-    if device.type == "cuda" or gaussians.colors_may_be_non_finite:
+    if device.type == "cuda":
+        mark_non_finite_colors(gaussians.sh, status)
+    elif gaussians.colors_may_be_non_finite:
         status.masked_fill_(~gaussians.finite, int(projection.NON_FINITE))
     return Projected(splats, status, depths)
+
+
+def mark_non_finite_colors(sh: Tensor, status: Tensor) -> None:
+    """Set the status [N] of Gaussians with a coefficient that is not finite, [N, K, 3]; one launch."""
+    inputs, outputs = [view(sh, wp.vec3)], [view(status, wp.uint8)]
+    launch_plain(projection.mark_non_finite_colors, sh.shape[0] * sh.shape[1], inputs, outputs, device=sh.device)
+
+
+def leave_out_non_finite(projected: Projected, features: Tensor | None) -> None:
+    """On CUDA, leave out Gaussians some feature of which is NaN or infinity; on the CPU they were refused."""
+    if features is not None and features.is_cuda:
+        rows = torch.isfinite(features.detach().sum(dim=1, dtype=torch.float64))
+        projected.status.masked_fill_(~rows, int(projection.NON_FINITE))
 
 
 def depth_order(projected: Projected) -> Tensor:
@@ -172,8 +188,7 @@ def depth_order(projected: Projected) -> Tensor:
     order = scratch("order", 2 * count, torch.int32, device)
     torch.index_select(projected.depths, 0, visible, out=keys[:count])
     order[:count] = visible
-    if count:
-        wp.utils.radix_sort_pairs(view(keys, wp.float32), view(order, wp.int32), count)
+    sort_pairs(keys, order, count, wp.float32)
     return order[:count]
 
 
@@ -191,13 +206,13 @@ def shade(gaussians: Gaussians, camera: Camera, order: Tensor, degree: int) -> T
     return colors
 
 
-def _first_places(counts: Tensor) -> tuple[Tensor, int]:
+def _first_places(counts: Tensor, limit: int = MAX_INTERSECTIONS) -> tuple[Tensor, int]:
     """Exclusive prefix sum with the total at the end, int32 [n + 1], and the total."""
     places = torch.zeros(len(counts) + 1, dtype=torch.int64, device=counts.device)
     torch.cumsum(counts, 0, out=places[1:])
     total = int(places[-1])  # the one host synchronisation of the render path on CUDA: it sizes the lists
-    if total > MAX_INTERSECTIONS:
-        raise InputError(f"{total} tile intersections exceed 2^31 - 1; render at a lower resolution or fewer Gaussians")
+    if total > limit:
+        raise InputError(f"{total} tile intersections exceed {limit}; render at a lower resolution or fewer Gaussians")
     return places.to(torch.int32), total
 
 
@@ -217,7 +232,7 @@ def bin_splats(
     `keep` the lists have memory of their own: they outlive the view, as a backward pass needs it.
     """
     device = order.device
-    packed = view(colors, wp.vec3) if colors is not None else wp.empty(0, dtype=wp.vec3, device=str(device))
+    packed = view(colors, wp.vec3) if colors is not None else wp.empty(0, dtype=wp.vec3, device=warp_device(device))
     memory = splat_memory(len(order), device, None if keep else "ordered splats")
     order = order.clone() if keep else order
     count = bin_by_sorting if device.type == "cuda" else bin_by_counting
@@ -280,7 +295,7 @@ def bin_by_sorting(
     splats = as_splats(memory)
     inputs = [view(order, wp.int32), projected.splats, colors, view(projected.status, wp.uint8), *size]
     launch_plain(binning.count_splat_tiles, count, inputs, [splats, view(splat_counts, wp.int32)], device=device)
-    entries, total = _first_places(splat_counts)
+    entries, total = _first_places(splat_counts, MAX_SORTED)
     listed, places_of, tiles_of = (_intersections(name, total, device, keep) for name in ("listed", "places", "tiles"))
     keys = scratch("tile keys", 2 * total, torch.int32, device)
     values = scratch("tile values", 2 * total, torch.int32, device)
@@ -288,8 +303,7 @@ def bin_by_sorting(
     outputs = [view(t, wp.int32) for t in (tiles_of, values, ranks)]
     launch_plain(binning.emit_tiles, count, [splats, *size, view(entries, wp.int32)], outputs, device=device)
     keys[:total] = tiles_of
-    if total:
-        wp.utils.radix_sort_pairs(view(keys, wp.int32), view(values, wp.int32), total, end_bit=grid.bit_length())
+    sort_pairs(keys, values, total, wp.int32, end_bit=grid.bit_length())
     edges = torch.arange(grid + 1, dtype=torch.int32, device=device)
     offsets = torch.searchsorted(keys[:total], edges).to(torch.int32)
     outputs = [view(listed, wp.int32), view(places_of, wp.int32)]

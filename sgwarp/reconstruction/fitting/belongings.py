@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sgwarp.errors import InputError
+from sgwarp.files.arrays import read_array
 from sgwarp.files.images import read_alpha, read_ids, read_rgb
 from sgwarp.io.companions import PICTURES, Companions
 from sgwarp.io.undistort import same_shape
@@ -117,10 +118,7 @@ def _read_mask(path: Path, view: View) -> NDArray[np.bool_]:
 def _read_depth(path: Path, view: View, unit: float) -> NDArray[np.float32]:
     if path.suffix.lower() != ".npy":
         return onto_view(path, read_ids(path).astype(np.float32) * np.float32(unit), view)
-    try:
-        depth = np.load(path, allow_pickle=False)
-    except (ValueError, EOFError, OSError):
-        raise InputError(f"{path}: is not an array that NumPy can read; write it again") from None
+    depth = read_array(path)
     depth = depth[..., 0] if depth.ndim == 3 and depth.shape[2] == 1 else depth
     if depth.ndim != 2 or depth.dtype.kind not in "fiu":
         raise InputError(f"{path}: expected depth [H, W], got {depth.dtype} {list(depth.shape)}")

@@ -19,6 +19,7 @@ RESET_EVERY = 3_000
 LEAST_RESET = 1_000  # steps between two resets, however short the run: opacities need some hundred to recover
 CHILDREN = 2  # of a Gaussian that is split
 SHRINK = 0.8 * CHILDREN  # of their scales
+UNSEEN_TURNS = 2  # turns through all photographs in which a Gaussian is not seen before it is removed
 HUGE = 0.1  # scale beyond which a Gaussian is removed once opacities have been reset [extent]
 FAINT = 0.01  # what opacities are reset to
 
@@ -28,9 +29,12 @@ class Densify:
 
     wants_means2d = True
 
-    def __init__(self, settings: FitSettings, extent: float, count: int, device: torch.device) -> None:
+    def __init__(
+        self, settings: FitSettings, extent: float, photographs: int, count: int, device: torch.device
+    ) -> None:
         self.settings = settings
         self.extent = extent
+        self.patience = UNSEEN_TURNS * photographs
         self._forget(count, device)
 
     def _forget(self, count: int, device: torch.device) -> None:
@@ -79,7 +83,7 @@ class Densify:
         model.append(rows, {"means": model["means"][rows] + offsets, "scales": (scales / SHRINK).log()})
 
     def _prune(self, model: Model, remove_huge: bool) -> None:
-        kept = model["opacities"] >= self.settings.least_opacity
+        kept = (model["opacities"] >= self.settings.least_opacity) & (model.skipped < self.patience)
         if remove_huge:
             kept &= model["scales"].amax(dim=1) <= HUGE * self.extent
         if bool(kept.any()):

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 from collections.abc import Sequence
 from dataclasses import replace
 from typing import Any
@@ -14,19 +15,24 @@ from sgwarp.errors import InputError
 from sgwarp.ops.neighbors import mean_squared_neighbor_distance
 from sgwarp.reconstruction.depth import SH_C0
 from sgwarp.reconstruction.fitting.belongings import depth_from_folder as depth_from_folder
-from sgwarp.reconstruction.fitting.photographs import Photograph, camera_extent
+from sgwarp.reconstruction.fitting.photographs import Photograph
 from sgwarp.reconstruction.fitting.settings import FitSettings
+from sgwarp.reconstruction.stereo import estimate_depth
+from sgwarp.runs.progress import Report
 from sgwarp.runs.seeds import generator
-from sgwarp.scene import SH_COUNTS, Gaussians, View
+from sgwarp.scene import SH_COUNTS, Gaussians
 
+logger = logging.getLogger("sgwarp")
 OPACITY = {"default": 0.1, "mcmc": 0.5}  # of the reference implementations
 SIZE = 1.0  # in root mean square distances to the three nearest others
-RANDOM_SIZE = 0.35  # of random points: larger ones, right in front of a camera, would hide the scene from it
+RANDOM_SIZE = 0.35  # of points anywhere: larger ones, right in front of a camera, would hide the scene from it
 LEAST_DISTANCE = 1e-4  # [extent of the cameras], for points in the same place
 VISIBLE = 1 / 255  # opacity from which on a Gaussian changes a pixel
 LEAST_POINTS = 4  # that three neighbours need
 RANDOM_COUNT = 50_000
-NEAREST, FARTHEST = 0.2, 4.0  # of random points [extent of the cameras]
+SHARE_OF_CAP = 2  # so much of the cap is left to the fit: the half
+LEAST_CERTAIN = 500  # depths that are worth starting from
+NEAREST, FARTHEST = 0.2, 4.0  # of points anywhere [extent of the cameras]
 
 
 def gaussians_from_points(
@@ -82,29 +88,71 @@ def gaussians_from_points(
 
 
 def random_points(
-    photographs: Sequence[Photograph], views: Sequence[View], settings: FitSettings
-) -> tuple[Tensor, Tensor]:
-    """Points at random pixels and distances in front of the cameras, with the colours of these pixels.
+    photographs: Sequence[Photograph], settings: FitSettings, progress: Report | None = None
+) -> tuple[Tensor, Tensor, float]:
+    """Random pixels of the photographs at the depth where others agree with them, with their colors.
 
-    Distances are spread evenly by their logarithm.
+    Points anywhere on their rays explain the photographs they come from and hide the scene from the others: a fit then
+    ends in fog. Only where photographs agree nowhere is that what remains; distances are then spread evenly by their
+    logarithm.
+
+    Args:
+        photographs: With cameras in the frame of the fit.
+        settings: Cap and seed.
+        progress: Called as `progress(done, total, text)`.
 
     Returns:
-        Positions [m], float64 [N, 3], and colours in [0, 1], float32 [N, 3].
+        Positions, float64 [N, 3], colors in [0, 1], float32 [N, 3], and the size of Gaussians there, in root mean
+        square distances to the three nearest others.
     """
-    extent = camera_extent(views)
-    count = min(settings.cap, RANDOM_COUNT)
+    count = min(settings.cap // SHARE_OF_CAP, RANDOM_COUNT)
     random = generator(settings.seed, 0, "random points")
-    positions, colours = [], []
+    places, colors = _points_where_photographs_agree(photographs, count, random, progress)
+    if len(places) >= LEAST_CERTAIN:
+        return places, colors, SIZE
+    logger.warning("start: the photographs agree nowhere, so points lie anywhere in view; the fit may end in fog")
+    return *_points_anywhere(photographs, count, random), RANDOM_SIZE
+
+
+def completed(
+    positions: Tensor, colors: Any, photographs: Sequence[Photograph], settings: FitSettings, progress: Report
+) -> tuple[Tensor, Tensor]:
+    """Few points, such as features leave them, and more of those where photographs agree, up to half the cap."""
+    random = generator(settings.seed, 0, "more points")
+    count = min(settings.cap // SHARE_OF_CAP, RANDOM_COUNT) - len(positions)
+    more, their_colors = _points_where_photographs_agree(photographs, count, random, progress)
+    logger.info("start: %d points are few; %d are added where photographs agree", len(positions), len(more))
+    own = torch.as_tensor(colors).to(torch.float32)
+    return torch.cat([positions, more]), torch.cat([own, their_colors])
+
+
+def _points_where_photographs_agree(
+    photographs: Sequence[Photograph], count: int, random: torch.Generator, progress: Report | None
+) -> tuple[Tensor, Tensor]:
+    """At most `count` pixels at their depth, and their colors."""
+    images = (photograph.image().cpu().numpy() for photograph in photographs)
+    maps = estimate_depth(images, [photograph.camera for photograph in photographs], 1.0, progress)
+    places = torch.from_numpy(np.concatenate([m.points[m.known.reshape(-1)] for m in maps]))
+    colors = torch.from_numpy(np.concatenate([m.colors[m.known] for m in maps]))
+    share = sum(float(m.known.mean()) for m in maps) / len(maps)
+    logger.info("start: the photographs agree on the depth of %.0f %% of their pixels", 100 * share)
+    chosen = torch.randperm(len(places), generator=random)[:count].sort().values
+    return places[chosen], colors[chosen]
+
+
+def _points_anywhere(photographs: Sequence[Photograph], count: int, random: torch.Generator) -> tuple[Tensor, Tensor]:
+    """Points at random pixels and distances in front of the cameras."""
+    positions, colors = [], []
     for index, photograph in enumerate(photographs):
         share = (count + len(photographs) - 1 - index) // len(photographs)  # they add up to `count`
         camera = photograph.camera
         u, v, w = torch.rand(3, share, generator=random, dtype=torch.float64)
         x, y = u * camera.width, v * camera.height
-        depth = extent * NEAREST * (FARTHEST / NEAREST) ** w
+        depth = NEAREST * (FARTHEST / NEAREST) ** w
         rays = torch.stack([x, y, torch.ones_like(x)], dim=1) @ torch.linalg.inv(camera.K).T
         positions.append((rays * depth[:, None]) @ camera.world_to_camera[:3, :3] + camera.position)
-        colours.append(photograph.image().cpu()[y.long(), x.long()])
-    return torch.cat(positions), torch.cat(colours)
+        colors.append(photograph.image().cpu()[y.long(), x.long()])
+    return torch.cat(positions), torch.cat(colors)
 
 
 def adapted(gaussians: Gaussians, settings: FitSettings) -> Gaussians:

@@ -16,6 +16,7 @@ from sgwarp.scene import Camera
 REFINE_UNTIL = 25_000  # of the reference's steps
 GROWTH = 1.05  # of the count at each refinement, and more where that would not reach the cap
 FULL_AT = 15_000  # of the reference's steps, by which the cap is reached
+UNSEEN_TURNS = 2  # turns through all photographs in which a Gaussian is not seen before it is moved
 MOST_COPIES = 51  # that the change of opacity and scale accounts for
 LEAST_LEFT = 1e-6  # opacities end this far below 1
 
@@ -25,9 +26,10 @@ class MarkovChain:
 
     wants_means2d = False
 
-    def __init__(self, settings: FitSettings, extent: float) -> None:
+    def __init__(self, settings: FitSettings, extent: float, photographs: int) -> None:
         self.settings = settings
         self.extent = extent
+        self.patience = UNSEEN_TURNS * photographs
 
     def after_step(self, model: Model, step: int, gradients: Gradients, taken: Taken, camera: Camera) -> None:
         """Refine at its intervals, and add noise; `step` counts from 1."""
@@ -40,8 +42,8 @@ class MarkovChain:
         add_noise(model["means"], model["quats"], model["scales"], model["opacities"], seed, size)
 
     def _relocate(self, model: Model, step: int) -> None:
-        """Move what has become transparent to where opaque Gaussians are."""
-        alive = model["opacities"] > self.settings.least_opacity
+        """Move what has become transparent, or has left the view of all cameras, to where opaque Gaussians are."""
+        alive = (model["opacities"] > self.settings.least_opacity) & (model.skipped < self.patience)
         dead, living = (~alive).nonzero().flatten(), alive.nonzero().flatten()
         if len(dead) and len(living):
             hosts = self._choose(model, living, len(dead), generator(self.settings.seed, step, "relocate"))

@@ -1,4 +1,4 @@
-"""The photographs of a fit: read once, checked, made smaller, and kept as bytes."""
+"""The photographs of a fit: read once, checked, made smaller, and kept as bytes, many of them in a file."""
 
 from __future__ import annotations
 
@@ -15,12 +15,12 @@ from torch import Tensor
 from sgwarp.errors import InputError
 from sgwarp.files.images import read_alpha
 from sgwarp.reconstruction.fitting.belongings import masks_from_folder as masks_from_folder
+from sgwarp.reconstruction.fitting.pixels import PixelStore, StoredPixels
 from sgwarp.runs.progress import Report
 from sgwarp.scene import Camera, View
 
 logger = logging.getLogger("sgwarp")
 LEAST_VIEWS = 3  # with fewer, nearly any scene explains them
-EXTENT_MARGIN = 1.1  # of the reference implementation
 
 Masks = Callable[[View], Any]
 
@@ -31,8 +31,8 @@ class Photograph:
 
     Attributes:
         stem: Name of the view.
-        camera: At the size of `pixels`.
-        pixels: uint8 [H, W, 3].
+        camera: At the size of the pixels.
+        stored: Its pixels, uint8 [H, W, 3], or where they are kept.
         mask: Which pixels count, bool [H, W], or None for all.
         alpha: How opaque the pixels are, float32 [H, W] in [0, 1], or None where all are.
         path: Its file.
@@ -40,10 +40,15 @@ class Photograph:
 
     stem: str
     camera: Camera
-    pixels: Tensor
+    stored: Tensor | StoredPixels
     mask: Tensor | None = None
     alpha: Tensor | None = None
     path: Path | None = None
+
+    @property
+    def pixels(self) -> Tensor:
+        """uint8 [H, W, 3]."""
+        return self.stored if isinstance(self.stored, Tensor) else self.stored.read()
 
     def image(self, background: Tensor | None = None) -> Tensor:
         """float32 [H, W, 3] in [0, 1]; transparent pixels show the background, float32 [3], black if None."""
@@ -58,15 +63,17 @@ def read_photographs(
     views: Sequence[View],
     *,
     downscale: int = 1,
+    largest: int = 0,
     masks: Masks | None = None,
     device: str | torch.device = "cpu",
     progress: Report | None = None,
 ) -> list[Photograph]:
-    """Read all photographs; those that cannot be used are left out, with a logged notice.
+    """Read all photographs; those that cannot be used or whose mask leaves nothing are left out, with a notice.
 
     Args:
         views: Posed photographs.
         downscale: Divide width and height by this; pixels are averaged.
+        largest: Photographs that are then wider or higher are scaled down to this, with a notice [pixels]; 0 for none.
         masks: Which pixels of a view count, [H, W] of its photograph, zero for those that do not; or None for all.
 
     Raises:
@@ -74,17 +81,26 @@ def read_photographs(
     """
     if downscale < 1:
         raise InputError(f"downscale: expected a whole number of at least 1, got {downscale}")
+    if largest < 0:
+        raise InputError(f"largest: expected a size in pixels, or 0 for none, got {largest}")
     report = progress or (lambda done, total, name: None)
     photographs: list[Photograph] = []
     failed: list[InputError] = []
+    hidden: list[str] = []
+    store = PixelStore(device)
     report(0, len(views), "")
     for done, view in enumerate(views, start=1):
         if view.image_path is None:
             raise InputError(f"view {view.stem}: has no photograph; a scene is fitted to photographs")
         try:
-            photographs.append(_read(view, downscale, masks, device))
+            photograph = _read(view, _size(view.camera, downscale, largest), masks, store)
         except InputError as error:
             failed.append(error)
+        else:
+            if photograph is None:
+                hidden.append(view.stem)
+            else:
+                photographs.append(photograph)
         report(done, len(views), view.stem)
     if failed and not photographs:
         raise failed[0]
@@ -92,42 +108,57 @@ def read_photographs(
         logger.warning(
             "left out %d of %d photographs that cannot be used, first: %s", len(failed), len(views), failed[0]
         )
+    if hidden:
+        logger.warning("left out %d photographs whose mask leaves no pixel, first %s", len(hidden), hidden[0])
+    scaled = [view.camera for view in views if largest and max(view.camera.size) // downscale > largest]
+    if scaled:
+        logger.warning(
+            "%d photographs are scaled down to %d pixels (the first is %d x %d); --max-size sets another limit",
+            *(len(scaled), largest, scaled[0].width, scaled[0].height),
+        )
     return photographs
 
 
-def _read(view: View, downscale: int, masks: Masks | None, device: str | torch.device) -> Photograph:
+def _size(camera: Camera, downscale: int, largest: int) -> tuple[int, int]:
+    """(height, width) that a photograph is scaled down to."""
+    height, width = (max(1, round(size / downscale)) for size in camera.size)
+    factor = min(1.0, largest / max(height, width)) if largest else 1.0
+    return max(1, round(factor * height)), max(1, round(factor * width))
+
+
+def _read(view: View, size: tuple[int, int], masks: Masks | None, store: PixelStore) -> Photograph | None:
+    """One photograph at a size, or None if its mask leaves nothing of it."""
     import cv2
 
     assert view.image_path is not None
-    pixels = (view.image().numpy() * 255.0).round().astype(np.uint8)
-    alpha: Any = read_alpha(view.image_path)
-    if alpha is not None and view.undistort is not None:
-        alpha = view.undistort(np.repeat(alpha[..., None], 3, axis=2))[..., 0]
     mask = None if masks is None else masks(view)
     if mask is not None:
         mask = np.asarray(mask) != 0
         if mask.shape != view.camera.size:
             got, want = list(mask.shape), list(view.camera.size)
             raise InputError(f"view {view.stem}: its mask has shape {got}, its photograph {want}; resize one of them")
-        if not mask.any():
-            raise InputError(f"view {view.stem}: its mask leaves no pixel; remove the view or its mask")
+    pixels = (view.image().numpy() * 255.0).round().astype(np.uint8)
+    alpha: Any = read_alpha(view.image_path)
+    if alpha is not None and view.undistort is not None:
+        alpha = view.undistort(np.repeat(alpha[..., None], 3, axis=2))[..., 0]
     camera = view.camera
-    if downscale > 1:
-        height, width = (max(1, round(size / downscale)) for size in camera.size)
-        camera = camera.resized(height, width)
-        pixels = cv2.resize(pixels, (width, height), interpolation=cv2.INTER_AREA)
+    if size != camera.size:
+        camera = camera.resized(*size)
+        pixels = cv2.resize(pixels, size[::-1], interpolation=cv2.INTER_AREA)
         if mask is not None:
-            mask = cv2.resize(mask.astype(np.float32), (width, height), interpolation=cv2.INTER_AREA) > 0.5
-            if not mask.any():
-                raise InputError(f"view {view.stem}: its mask leaves no pixel at this size; take a smaller downscale")
+            mask = cv2.resize(mask.astype(np.float32), size[::-1], interpolation=cv2.INTER_AREA) > 0.5
         if alpha is not None:
-            alpha = cv2.resize(alpha, (width, height), interpolation=cv2.INTER_AREA)
-    known = None if mask is None else torch.from_numpy(mask).to(device)
-    opaque = None if alpha is None else torch.from_numpy(np.ascontiguousarray(alpha)).to(device, torch.float32) / 255.0
-    return Photograph(view.stem, camera, torch.from_numpy(pixels).to(device), known, opaque, Path(view.image_path))
+            alpha = cv2.resize(alpha, size[::-1], interpolation=cv2.INTER_AREA)
+    if mask is not None and not mask.any():
+        return None
+    known = None if mask is None else torch.from_numpy(mask).to(store.device)
+    opaque = None
+    if alpha is not None:
+        opaque = torch.from_numpy(np.ascontiguousarray(alpha)).to(store.device, torch.float32) / 255.0
+    return Photograph(view.stem, camera, store.put(pixels), known, opaque, Path(view.image_path))
 
 
-def require_enough(views: Sequence[View | Photograph]) -> None:
+def require_enough(views: Sequence[View] | Sequence[Photograph]) -> None:
     """Raise InputError unless there are enough photographs to fit a scene to."""
     if len(views) < LEAST_VIEWS:
         names = f" ({', '.join(view.stem for view in views)})" if views else ""
@@ -138,20 +169,29 @@ def require_enough(views: Sequence[View | Photograph]) -> None:
 
 
 def require_overlap(photographs: Sequence[Photograph], means: Tensor, held_out: Sequence[Photograph] = ()) -> None:
-    """Raise InputError naming a photograph that shows none of the points [N, 3] that the scene starts from.
+    """Say how many photographs show none of the points [N, 3] that the scene starts from.
 
-    Of photographs that nothing is fitted to, only warn.
+    That may be right: features are rarely found in the sky, on a blank wall or a ceiling.
+
+    Raises:
+        InputError: No photograph shows any.
     """
     for blind in (p for p in held_out if not bool(_shown(p.camera, means).any())):
         logger.warning("held-out view %s shows none of the points to start from: is its pose right?", blind.stem)
     blinds = [p for p in photographs if not bool(_shown(p.camera, means).any())]
-    if blinds:
-        camera, first = blinds[0].camera, blinds[0].path or blinds[0].stem
+    if not blinds:
+        return
+    first = blinds[0].path or blinds[0].stem
+    if len(blinds) == len(photographs):
         raise InputError(
-            f"{first}: shows none of the {len(means)} points that the scene starts from, between "
-            f"{camera.near:g} and {camera.far:g} m of depth ({len(blinds)} of {len(photographs)} photographs do not); "
-            "correct its pose, remove it, or start without points (--init random)"
+            f"{first}: shows none of the {len(means)} points that the scene starts from, nor does any other "
+            "photograph; points and poses do not belong together: correct them, or start without points (--init random)"
         )
+    logger.warning(
+        "%d of %d photographs show none of the %d points to start from, first %s: right for sky or blank walls, else "
+        "correct their poses",
+        *(len(blinds), len(photographs), len(means), first),
+    )
 
 
 def _shown(camera: Camera, means: Tensor) -> Tensor:
@@ -162,13 +202,3 @@ def _shown(camera: Camera, means: Tensor) -> Tensor:
     x, y = pixels[:, 0] / points[:, 2], pixels[:, 1] / points[:, 2]
     inside = (x >= 0) & (x < camera.width) & (y >= 0) & (y < camera.height)
     return inside & (points[:, 2] > camera.near) & (points[:, 2] < camera.far)
-
-
-def camera_extent(views: Sequence[View]) -> float:
-    """Radius of the cameras around their centre [m], to which rates and sizes are relative; 1 if all are in one place.
-
-    As in the reference implementation, a tenth wider.
-    """
-    places = torch.stack([view.camera.position for view in views])
-    radius = float((places - places.mean(dim=0)).norm(dim=1).max())
-    return EXTENT_MARGIN * radius if radius > 1e-6 else 1.0

@@ -23,29 +23,33 @@ from sgwarp.ops.photometric import photometric_loss
 from sgwarp.ops.splatting.autograd import rasterize as rasterize_with_gradients
 from sgwarp.ops.splatting.forward import rasterize
 from sgwarp.reconstruction.fitting.checkpoint import Checkpoint, fingerprint
+from sgwarp.reconstruction.fitting.coverage import report_start, seen_by_any
 from sgwarp.reconstruction.fitting.densify import Densify
 from sgwarp.reconstruction.fitting.exposure import Exposure
-from sgwarp.reconstruction.fitting.initial import RANDOM_SIZE, adapted, gaussians_from_points, random_points
+from sgwarp.reconstruction.fitting.frame import Frame
+from sgwarp.reconstruction.fitting.initial import adapted, completed, gaussians_from_points, random_points
 from sgwarp.reconstruction.fitting.mcmc import MarkovChain
 from sgwarp.reconstruction.fitting.measurement import Measurement as Measurement
 from sgwarp.reconstruction.fitting.model import Gradients, Model
 from sgwarp.reconstruction.fitting.photographs import (
     Masks,
     Photograph,
-    camera_extent,
     read_photographs,
     require_enough,
     require_overlap,
 )
 from sgwarp.reconstruction.fitting.settings import FitSettings
 from sgwarp.runs.interrupt import deferred_interrupt
+from sgwarp.runs.isolation import isolated
 from sgwarp.runs.log import RunLog
 from sgwarp.runs.progress import Report
 from sgwarp.runs.seeds import generator, view_at
 from sgwarp.scene import Gaussians, View
 
 logger = logging.getLogger("sgwarp")
-LARGEST_NEAR = 0.01  # near plane [extent of the cameras]
+EXTENT = 1.0  # of the cameras, in the frame that scenes are fitted in
+FEW_POINTS = 20_000  # to start from, below which more are added where photographs agree
+MOST_MEASURED = 64  # of the fitted views
 REPORT_EVERY = 10  # steps between two reports of the progress
 MEMORY = 0.99  # of the loss that is reported
 
@@ -58,15 +62,19 @@ class Fitted:
         gaussians: The scene.
         curve: Measurements on the way, the last one of `gaussians`.
         held_out: PSNR of each held-out view by its stem [dB].
+        fitted_psnr: Mean PSNR of the views that it was fitted to [dB]; far above that of the held-out ones, it is
+            overfitted.
         complete: False if it was interrupted.
     """
 
     gaussians: Gaussians
     curve: list[Measurement]
     held_out: dict[str, float]
+    fitted_psnr: float
     complete: bool
 
 
+@isolated
 def fit(
     views: Sequence[View],
     start: Gaussians | tuple[Any, Any] | None = None,
@@ -74,6 +82,7 @@ def fit(
     settings: FitSettings | None = None,
     *,
     downscale: int = 1,
+    largest: int = 0,
     masks: Masks | Mapping[str, Any] | None = None,
     checkpoint: str | os.PathLike[str] | None = None,
     checkpoint_every: int = 1000,
@@ -94,6 +103,7 @@ def fit(
         held_out: Posed photographs to measure on; nothing is fitted to them.
         settings: Steps, strategy, cap and everything else.
         downscale: Divide width and height of the photographs by this.
+        largest: Photographs that are then wider or higher are scaled down to this [pixels]; 0 for none.
         masks: Which pixels of a view count, also of those held out, [H, W] of its photograph, zero for those that do
             not; by the name of the view, or a function of the view. A view without one counts as a whole.
         checkpoint: File to keep the state of the run in, every `checkpoint_every` steps and when interrupted; it is
@@ -122,14 +132,16 @@ def fit(
         raise InputError("resume: name the file of the checkpoint")
     if checkpoint_every < 1:
         raise InputError(f"checkpoint_every: expected at least 1, got {checkpoint_every}")
-    extent = camera_extent(views)
+    frame = Frame.around(views)
     with log.stage("read"):
         photographs, shown = (
-            [_near_enough(p, extent) for p in read_photographs(v, downscale=downscale, masks=given, device=device)]
-            for v in (views, held_out)
+            read_photographs(
+                [*map(frame.view, group)], downscale=downscale, largest=largest, masks=given, device=device
+            )
+            for group in (views, held_out)
         )
     require_enough(photographs)
-    run = _Run(settings, photographs, shown, extent, torch.device(device), log)
+    run = _Run(settings, photographs, shown, EXTENT, torch.device(device), log)
     with log.stage("start"):
         if resume:
             assert path is not None
@@ -137,45 +149,43 @@ def fit(
         else:
             if path is not None and path.exists():
                 logger.warning("%s: is left from a run that did not end, and is replaced; --resume would go on", path)
-            run.begin(_starting(start, photographs, shown, views, settings, run.extent, device))
+            first = _starting(start, photographs, shown, frame, settings, report, device)
+            report_start(photographs, first.means, frame)
+            run.begin(first)
     with deferred_interrupt() as interrupted:
         complete = run.go(report, path, checkpoint_every, interrupted)
     if path is not None:
-        run.save(path)
-    measured = run.measure()
+        run.try_to_save(path)
+    if complete:
+        run.remove_unseen()
+    measured, on_fitted = run.measure(), run.measure_fitted()
     if path is not None and complete and not keep_checkpoint:
         path.unlink(missing_ok=True)
-    return Fitted(run.model.gaussians(), run.curve, measured, complete)
-
-
-def _near_enough(photograph: Photograph, extent: float) -> Photograph:
-    """With a near plane that fits the scene, which may be smaller than one metre."""
-    camera = photograph.camera
-    return dataclasses.replace(
-        photograph, camera=dataclasses.replace(camera, near=min(camera.near, LARGEST_NEAR * extent))
-    )
+    return Fitted(frame.restored(run.model.gaussians()), run.curve, measured, on_fitted, complete)
 
 
 def _starting(
     start: Gaussians | tuple[Any, Any] | None,
     photographs: Sequence[Photograph],
     held_out: Sequence[Photograph],
-    views: Sequence[View],
+    frame: Frame,
     settings: FitSettings,
-    extent: float,
+    report: Report,
     device: str | torch.device,
 ) -> Gaussians:
+    """What the first step sees, in the frame of the fit."""
     if isinstance(start, Gaussians):
-        gaussians = adapted(start, settings).to(device)
+        gaussians = adapted(frame.gaussians(start), settings).to(device)
         require_overlap(photographs, gaussians.means, held_out)
         return gaussians
     if start is None:
-        positions, colours = random_points(photographs, views, settings)
-        return gaussians_from_points(positions, colours, settings, extent, device, RANDOM_SIZE)
-    positions, colours = start
-    gaussians = gaussians_from_points(positions, colours, settings, extent, device)
-    require_overlap(photographs, torch.as_tensor(positions).to(torch.float32), held_out)  # before the cap thins them
-    return gaussians
+        positions, colours, size = random_points(photographs, settings, report)
+        return gaussians_from_points(positions, colours, settings, EXTENT, device, size)
+    positions, colours = frame.points(start[0]), start[1]
+    require_overlap(photographs, positions.to(torch.float32), held_out)  # before the cap thins them
+    if len(positions) < min(FEW_POINTS, settings.cap // 2):
+        positions, colours = completed(positions, colours, photographs, settings, report)
+    return gaussians_from_points(positions, colours, settings, EXTENT, device)
 
 
 class _Run:
@@ -202,8 +212,11 @@ class _Run:
         self.exposure = Exposure(len(photographs), device) if settings.exposure else None
         self.step = 0
         self.seconds = 0.0
-        self.loss = math.nan
-        self.psnr = math.nan  # of the photograph that was looked at last
+        # Steps leave these on the device and nobody reads them until they are shown: on CUDA to read is to wait.
+        self._loss = torch.full((), math.nan, dtype=torch.float64, device=device)
+        self._unseen = torch.zeros((), dtype=torch.int64, device=device)
+        self._looked_at: tuple[Tensor, Tensor, Tensor | None] | None = None
+        self._psnr = math.nan
         self.curve: list[Measurement] = []
 
     def begin(self, gaussians: Gaussians) -> None:
@@ -213,14 +226,24 @@ class _Run:
     def _adopt(self, model: Model) -> None:
         self.model = model
         if self.settings.strategy == "mcmc":
-            self.strategy = MarkovChain(self.settings, self.extent)
+            self.strategy = MarkovChain(self.settings, self.extent, len(self.photographs))
         else:
-            self.strategy = Densify(self.settings, self.extent, len(model), self.device)
+            self.strategy = Densify(self.settings, self.extent, len(self.photographs), len(model), self.device)
 
     def go(
         self, report: Report, checkpoint: Path | None, checkpoint_every: int, interrupted: Callable[[], bool]
     ) -> bool:
         """Take the remaining steps; returns False if interrupted before the last one."""
+        try:
+            return self._go(report, checkpoint, checkpoint_every, interrupted)
+        finally:
+            self._settle()
+            self.log.leave_out("updates_of_unseen_gaussians", int(self._unseen))
+            self._unseen.zero_()
+
+    def _go(
+        self, report: Report, checkpoint: Path | None, checkpoint_every: int, interrupted: Callable[[], bool]
+    ) -> bool:
         settings = self.settings
         began, first = time.perf_counter(), self.step
         while self.step < settings.steps:
@@ -232,21 +255,41 @@ class _Run:
                 refine = self._take_step()
             # Before the refinement, as the reference does: it may have just made all Gaussians transparent.
             if self.step % settings.evaluate_every == 0 and self.step < settings.steps:
+                self._settle()
                 self.measure()
             with self._timed():
                 refine()
             if checkpoint is not None and self.step % checkpoint_every == 0 and self.step < settings.steps:
+                self._settle()
                 with self.log.stage("checkpoint"):
-                    self.save(checkpoint)
+                    self.try_to_save(checkpoint)
         report(self.step, settings.steps, self._text((self.step - first) / max(time.perf_counter() - began, 1e-9)))
         return True
 
     @contextmanager
-    def _timed(self) -> Iterator[None]:
-        with self.log.stage("fit"):
-            before = time.perf_counter()
+    def _timed(self, wait: bool = False) -> Iterator[None]:
+        before = time.perf_counter()
+        with self.log.stage("fit", wait):
             yield
-            self.seconds += time.perf_counter() - before
+        self.seconds += time.perf_counter() - before
+
+    def _settle(self) -> None:
+        """Charge the steps, not what comes next, with what the device has yet to do."""
+        with self._timed(wait=True):
+            pass
+
+    @property
+    def loss(self) -> float:
+        """The running loss."""
+        return float(self._loss)
+
+    @property
+    def psnr(self) -> float:
+        """Of the photograph that was looked at last [dB]."""
+        if self._looked_at is not None:
+            self._psnr = psnr(*self._looked_at)
+            self._looked_at = None
+        return self._psnr
 
     def _take_step(self) -> Callable[[], None]:
         """Look at one photograph and update the Gaussians; the result refines their set."""
@@ -288,12 +331,12 @@ class _Run:
         taken = model.update(gradients, settings.means_rate_at(self.step, self.extent), settings)
         if self.exposure is not None and colour_map is not None and colour_map.grad is not None:
             self.exposure.update(index, colour_map.grad, share)
-        self.log.leave_out("updates_of_unseen_gaussians", len(model) - taken.count)
-        value = float(loss.detach())
-        self.loss = value if math.isnan(self.loss) else MEMORY * self.loss + (1 - MEMORY) * value
+        self._unseen += (taken.marks == 0).sum()
+        value = loss.detach().to(torch.float64)
+        self._loss = torch.where(self._loss.isnan(), value, MEMORY * self._loss + (1 - MEMORY) * value)
         self.step += 1
         if self.step % REPORT_EVERY == 0:
-            self.psnr = psnr(image.detach(), truth, photograph.mask)
+            self._looked_at = image.detach(), truth, photograph.mask
         return partial(self.strategy.after_step, model, self.step, gradients, taken, camera)
 
     def _background(self) -> Tensor | None:
@@ -317,10 +360,37 @@ class _Run:
             self.curve.append(Measurement(self.step, self.seconds, mean, self.loss, len(gaussians)))
         return values
 
+    def measure_fitted(self) -> float:
+        """Mean PSNR of the views that are fitted, of at most 64 of them [dB]."""
+        gaussians = self.model.gaussians()
+        background = torch.ones(3, device=self.device) if self.settings.background == "white" else None
+        chosen = self.photographs[:: 1 + (len(self.photographs) - 1) // MOST_MEASURED]
+        values = []
+        with self.log.stage("measure"):
+            for photograph in chosen:
+                image = rasterize(gaussians, photograph.camera, background=background).features
+                values.append(psnr(image, photograph.image(background), photograph.mask))
+        return sum(values) / len(values)
+
+    def remove_unseen(self) -> None:
+        """Remove the Gaussians that lie outside what the cameras can see: noise and moves have left them there."""
+        seen = seen_by_any(self.model.gaussians(), [photograph.camera for photograph in self.photographs])
+        if bool(seen.any()) and not bool(seen.all()):
+            self.log.leave_out("gaussians_no_camera_sees", int((~seen).sum()))
+            self.model.keep(seen)
+
     def _text(self, rate: float) -> str:
         held_out = f", held out {self.curve[-1].psnr:.2f} dB" if self.curve and self.held_out else ""
         speed = f", {rate:.1f} it/s" if self.step else ""
         return f"loss {self.loss:.4f}, {self.psnr:.2f} dB{held_out}, {len(self.model):,} Gaussians{speed}"
+
+    def try_to_save(self, path: Path) -> None:
+        """Write a checkpoint; where that fails, say so and go on: the next one may be written again."""
+        try:
+            self.save(path)
+        except InputError as error:
+            logger.warning("%s; the fit goes on without it", error)
+            self.log.leave_out("checkpoints")
 
     def save(self, path: Path) -> None:
         """Write a checkpoint."""
@@ -339,10 +409,14 @@ class _Run:
         """Go on from a checkpoint."""
         own = fingerprint(self.photographs, self.held_out)
         saved = Checkpoint.load(path, self.settings, own, self.device)
-        self._adopt(Model.restored(saved.model))
-        self.strategy.restore(saved.strategy)
-        if self.exposure is not None:
-            self.exposure.restore(saved.exposure)
-        self.step, self.seconds = saved.step, saved.seconds
-        (self.loss, self.psnr), *points = saved.curve
-        self.curve = [Measurement(*point) for point in points]  # type: ignore[arg-type]
+        try:
+            self._adopt(Model.restored(saved.model))
+            self.strategy.restore(saved.strategy)
+            if self.exposure is not None:
+                self.exposure.restore(saved.exposure)
+            self.step, self.seconds = saved.step, saved.seconds
+            (loss, self._psnr), *points = saved.curve
+            self._loss.fill_(loss)
+            self.curve = [Measurement(*point) for point in points]  # type: ignore[arg-type]
+        except (KeyError, TypeError, ValueError):
+            raise InputError(f"{path}: is damaged; start again without --resume") from None

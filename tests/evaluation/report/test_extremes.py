@@ -9,6 +9,8 @@ from sgwarp.evaluation.report import stability
 from sgwarp.evaluation.report.extremes import EXTREMES
 from sgwarp.evaluation.report.stability import check, check_gradients
 
+pytestmark = pytest.mark.slow
+
 SCHEDULES = ("lanes", "block")
 LARGEST_UNDECIDABLE = 0.2  # share of the pixels; more and a scene would not test what it is named for
 # What is culled because of the extreme itself, of 200.

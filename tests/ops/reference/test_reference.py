@@ -10,6 +10,8 @@ from sgwarp.ops.reference import rasterizer as reference
 from sgwarp.ops.reference.rasterizer import ReferenceSettings, harmonics, rasterize
 from sgwarp.scene import Camera, Gaussians
 
+pytestmark = pytest.mark.slow
+
 ALPHA_MIN, ALPHA_MAX, T_MIN = 1 / 255, 0.999, 1e-4
 C0 = 0.5 / math.sqrt(math.pi)
 IDENTITY = [1.0, 0.0, 0.0, 0.0]

@@ -1,10 +1,13 @@
 """The float64 oracle of lifting: transposition, and the centre mode case by case."""
 
+import pytest
 import torch
 
 from sgwarp.ops.reference.lifting import lift_center, lift_weighted, transpose_composite
 from sgwarp.ops.reference.rasterizer import composite, project_scene
 from sgwarp.scene import Camera, Gaussians
+
+pytestmark = pytest.mark.slow
 
 
 def test_lifting_is_the_transpose_of_rendering(scene):

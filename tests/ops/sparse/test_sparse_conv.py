@@ -68,6 +68,7 @@ def assert_near(ours, theirs, inputs, wide_inputs) -> None:
         assert largest_difference(a, b) < 2e-6
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("channels", [(32, 32), (10, 64), (96, 160), (64, 40)])
 @pytest.mark.parametrize(("side", "step", "stride"), CASES)
 def test_single_precision_is_the_dense_one(side, step, stride, channels):
@@ -161,6 +162,7 @@ def test_a_row_of_nan_reaches_its_neighbours_and_nobody_else(channels):
     assert torch.isnan(y).any(dim=1).tolist() == [True, True, False, False]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("dtype", "bound", "autocast"),
     [

@@ -62,6 +62,7 @@ def test_matches_the_oracle(scene, k, schedule):
     assert_is_the_oracles(gaussians, camera, ids, weights)
 
 
+@pytest.mark.slow
 def test_block_schedule_equals_lane_schedule(scene):
     _, gaussians, camera = scene
     (lane_ids, lane_weights), (block_ids, block_weights) = (top(gaussians, camera, 7, s) for s in ("lanes", "block"))
@@ -72,6 +73,7 @@ def test_block_schedule_equals_lane_schedule(scene):
     assert torch.equal(block_ids[clear], lane_ids[clear])
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("schedule", ["lanes", "block"])
 def test_all_weights_together_are_the_opacity(scene, schedule):
     """With room for all, every contributor is there once, and composites to the image."""
@@ -128,6 +130,7 @@ def test_equal_weights_stand_front_to_back(schedule):
     assert (top(sheets, camera, 2, schedule)[0][tied] == torch.tensor([strong, front])).all()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("schedule", ["lanes", "block"])
 @pytest.mark.parametrize(
     "name",

@@ -167,8 +167,10 @@ def test_block_schedule_equals_lane_schedule(scene, ordered):
     order = tiles.depth_order(projected)
     lists = tiles.bin_splats(projected, order, None, camera, places=True, tiles=True)
     ids = random_ids(*camera.size, 20)
+    blocky = torch.arange(20).view(4, 5)[None].repeat_interleave(max(camera.height // 4, 1), dim=1).to(torch.int32)
     maps = [
         FeatureMap(space="t", dense=random_map(camera, 20), valid=ids[0] > 5),
+        FeatureMap(space="t", ids=blocky, vectors=torch.randn(20, 20)),
         FeatureMap(space="t", ids=ids, vectors=torch.randn(20, 20)),
         FeatureMap(space="labels", ids=ids, labels=tuple(str(i) for i in range(20))),
     ]
@@ -177,6 +179,21 @@ def test_block_schedule_equals_lane_schedule(scene, ordered):
         add_weighted(lists, camera, feature_map, sums[0], SETTINGS, block=False, ordered=True)
         add_weighted(lists, camera, feature_map, sums[1], SETTINGS, block=True, ordered=ordered)
         assert_sums_close(sums[1], sums[0], scale=4.0)
+
+
+@pytest.mark.parametrize("ordered", [False, True])
+def test_blocks_lift_any_number_of_channels(make_scene, ordered):
+    """More and fewer channels than a block lifts, and opaque tiles, whose blocks end early."""
+    _, gaussians, camera = make_scene("opaque_stack")
+    projected = tiles.project(gaussians, camera, SETTINGS)
+    lists = tiles.bin_splats(projected, tiles.depth_order(projected), None, camera, places=True)
+    for channels in (1, 16, 40, 96):
+        feature_map = FeatureMap(space="t", dense=random_map(camera, channels))
+        sums = [LiftSums.zeros(len(gaussians), channels) for _ in range(2)]
+        for schedule, result in zip(("lanes", "block"), sums, strict=True):
+            block = schedule == "block"
+            add_weighted(lists, camera, feature_map, result, SETTINGS, block=block, ordered=ordered or not block)
+        assert_sums_close(sums[1], sums[0])
 
 
 def test_same_bits_for_any_number_of_threads(make_scene, monkeypatch):

@@ -103,7 +103,8 @@ def test_block_schedule_equals_lane_schedule(scene):
     lanes = composite(lists, camera, settings, None, True, "lanes")
     block = composite(lists, camera, settings, None, True, "block")
     clear = reference.rasterize(gaussians, camera).margin > BOUNDARY_BAND
-    for a, b in zip(lanes[:3], block[:3], strict=True):
+    assert len(lanes) == len(block) == 4  # colours, transmittance, depth sum, surface
+    for a, b in zip(lanes, block, strict=True):
         torch.testing.assert_close(a[clear], b[clear], rtol=1e-6, atol=1e-5)
     features = torch.rand(len(gaussians), 21)
     lanes = composite(lists, camera, settings, features, False, "lanes")
@@ -264,3 +265,14 @@ def test_inputs_are_checked(make_scene):
 def test_kernels_read_torch_memory_without_a_copy(make_scene):
     _, gaussians, _ = make_scene("random_cloud")
     assert launcher.view(gaussians.means, wp.vec3).ptr == gaussians.means.data_ptr()
+
+
+def test_colours_that_are_not_finite_are_marked_as_on_cuda(make_scene):
+    _, gaussians, _camera = make_scene("sh3")
+    sh = gaussians.sh.clone()
+    sh[3, 0, 1], sh[5, -1, 2], sh[8, 2, 0], sh[9] = torch.nan, torch.inf, -torch.inf, 3e38
+    status = torch.arange(len(gaussians)).to(torch.uint8) % 5
+    expected = torch.where(torch.isfinite(sh).flatten(1).all(dim=1), status, 1)
+    tiles.mark_non_finite_colors(sh, status)
+    assert torch.equal(status, expected.to(torch.uint8))
+    assert int((expected == 1).sum()) > 3

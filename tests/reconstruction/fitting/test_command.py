@@ -17,6 +17,8 @@ from sgwarp.errors import InputError
 from sgwarp.files.images import read_rgb
 from sgwarp.io.scenes import load_gaussians
 
+pytestmark = pytest.mark.slow
+
 
 def fails(capsys, *arguments) -> str:
     """Run a command that has to end with code 2; returns its one line on stderr."""
@@ -120,9 +122,13 @@ def start(boards, out: Path) -> subprocess.Popen:
     code = "import sys; from sgwarp.cli import main; sys.exit(main(sys.argv[1:]))"
     command = [sys.executable, "-c", code, "fit", str(boards.folder), *options]
     process = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, env={**os.environ})
+    until = time.monotonic() + 300
     while not out.with_name(f"{out.name}.checkpoint").exists():
         if process.poll() is not None:
             pytest.fail(process.stderr.read())
+        if time.monotonic() > until:
+            process.kill()
+            pytest.fail("no checkpoint after five minutes")
         time.sleep(0.01)
     return process
 
@@ -140,6 +146,47 @@ def test_ctrl_c_leaves_a_scene_and_a_checkpoint(boards, tmp_path):
     assert len(checkpoint["model"]["steps"]) == len(scene)
     run = json.loads((tmp_path / "run.json").read_text())
     assert run["curve"][-1]["step"] == checkpoint["step"] < 4000
+
+
+def test_sigterm_ends_like_ctrl_c(boards, tmp_path):
+    """What batch queues and containers send before they kill."""
+    out = tmp_path / "scene.ply"
+    process = start(boards, out)
+    process.send_signal(signal.SIGTERM)
+    _, errors = process.communicate(timeout=120)
+    assert process.returncode == 143, errors
+    assert errors.strip().endswith("sgwarp: terminated")
+    scene = load_gaussians(out)
+    checkpoint = torch.load(out.with_name("scene.ply.checkpoint"), weights_only=True)
+    assert len(checkpoint["model"]["steps"]) == len(scene)
+    assert json.loads((tmp_path / "run.json").read_text())["curve"][-1]["step"] == checkpoint["step"] < 4000
+    assert not list(tmp_path.glob(".*"))
+
+
+def test_a_checkpoint_that_cannot_be_written_costs_a_notice(boards, tmp_path, capsys, monkeypatch):
+    """It is tried again, and the fit goes on to its scene."""
+    from sgwarp.files import torch_files
+
+    save, tries = torch_files.torch.save, []
+
+    def full(content, file):
+        tries.append(content["step"])
+        if len(tries) < 3:
+            raise OSError(28, "No space left on device")
+        save(content, file)
+
+    monkeypatch.setattr(torch_files.torch, "save", full)
+    out = tmp_path / "scene.ply"
+    options = ["--steps", "20", "--cap", "1200", "--checkpoint-every", "5", "--out", str(out)]
+    assert main(["fit", str(boards.folder), *options]) == 0
+    assert tries == [5, 10, 15, 20]
+    lines = [line for line in capsys.readouterr().err.splitlines() if "cannot be written" in line]
+    assert len(lines) == 2
+    assert all("scene.ply.checkpoint" in line and "No space left on device" in line for line in lines)
+    assert json.loads((tmp_path / "run.json").read_text())["left_out"]["checkpoints"] == 2
+    assert len(load_gaussians(out)) > 1000
+    assert {path.name for path in tmp_path.iterdir()} >= {"scene.ply", "run.json"}
+    assert not list(tmp_path.glob(".*"))
 
 
 def test_a_scene_that_cannot_be_written_costs_no_run(boards, tmp_path, capsys, monkeypatch):
@@ -170,6 +217,27 @@ def test_a_damaged_checkpoint(boards, tmp_path, capsys):
     (tmp_path / "scene.ply.checkpoint").write_text("junk")
     message = fails(capsys, boards.folder, "--out", tmp_path / "scene.ply", "--steps", "5", "--resume")
     assert "is not a checkpoint, or is damaged" in message
+
+
+def test_a_missing_point_file_is_a_notice(boards, tmp_path, capsys):
+    """A list that names points which were not copied along; --depth does not even look for them."""
+    folder = Path(shutil.copytree(boards.folder, tmp_path / "stage"))
+    meta = json.loads((folder / "transforms.json").read_text()) | {"ply_file_path": "gone.ply"}
+    for name in ("points3D.ply", "sparse_pc.ply", "point_cloud.ply"):
+        (folder / name).unlink(missing_ok=True)
+    (folder / "transforms.json").write_text(json.dumps(meta))
+    out = tmp_path / "scene.ply"
+    assert main(["fit", str(folder), "--out", str(out), "--steps", "2", "--cap", "1200"]) == 0
+    assert "its 'ply_file_path' 'gone.ply' does not exist" in capsys.readouterr().err
+    assert out.is_file()
+
+
+def test_the_shipped_room_can_be_fitted(tmp_path):
+    from sgwarp.demo.data import ROOM
+
+    options = ["--steps", "2", "--cap", "1000", "--downscale", "4", "--out", str(tmp_path / "room.ply")]
+    assert main(["fit", str(ROOM), *options]) == 0
+    assert (tmp_path / "room.ply").is_file()
 
 
 def test_short_runs_reach_their_degree(boards, tmp_path):

@@ -18,10 +18,11 @@ from sgwarp.metrics.images import psnr
 from sgwarp.ops.splatting.forward import rasterize
 from sgwarp.reconstruction.depth import gaussians_from_depth
 from sgwarp.reconstruction.fitting.initial import depth_from_folder, gaussians_from_points, random_points
-from sgwarp.reconstruction.fitting.photographs import camera_extent, masks_from_folder, read_photographs
+from sgwarp.reconstruction.fitting.photographs import masks_from_folder, read_photographs
 from sgwarp.reconstruction.fitting.settings import FitSettings
 from sgwarp.reconstruction.fitting.trainer import fit
 from sgwarp.scene import View
+from sgwarp.scene.extent import camera_extent
 
 ONE_STEP = FitSettings(steps=1)
 

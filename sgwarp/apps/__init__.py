@@ -1,0 +1,1 @@
+"""What can be done with a scene that has semantics."""

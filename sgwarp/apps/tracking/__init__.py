@@ -1,0 +1,1 @@
+"""Moving scenes: semantics of every frame, fused over time, and what becomes of each object."""

@@ -1,0 +1,83 @@
+"""What the header of a PLY file claims, compared with the file before memory is taken for it."""
+
+from __future__ import annotations
+
+import os
+from dataclasses import dataclass, field
+
+from sgwarp.errors import InputError
+from sgwarp.files.access import open_input
+
+LONGEST = 1 << 20  # bytes of a header; that of a 3DGS scene has 1,500
+END = b"end_header"
+SIZES = {
+    **dict.fromkeys(("char", "uchar", "int8", "uint8"), 1),
+    **dict.fromkeys(("short", "ushort", "int16", "uint16"), 2),
+    **dict.fromkeys(("int", "uint", "float", "int32", "uint32", "float32"), 4),
+    **dict.fromkeys(("double", "float64"), 8),
+}
+
+
+@dataclass
+class _Element:
+    name: str
+    count: int
+    sizes: list[int] = field(default_factory=list)  # bytes of a property in a row, at least
+    lists: bool = False
+
+
+def check_ply(path: str | os.PathLike[str]) -> None:
+    """Refuse a PLY file that is shorter than its header says, or whose header does not end.
+
+    Headers that are malformed in another way are left to the reader behind it, which says how.
+
+    Raises:
+        InputError: The file is missing, cut short, or is none.
+    """
+    with open_input(path) as file:
+        head = file.read(LONGEST)
+        size = os.fstat(file.fileno()).st_size
+    if not head.startswith(b"ply"):
+        raise InputError(f"{path}: is not a valid PLY file (it does not begin with 'ply')")
+    at = head.find(END)
+    if at < 0 and size > LONGEST:
+        raise InputError(f"{path}: is not a valid PLY file (its header does not end within {LONGEST} bytes)")
+    newline = head.find(b"\n", at)
+    if at < 0 or newline < 0:
+        return
+    end = newline + 1
+    text, elements = _elements(head[:at])
+    rest = size - end
+    for element in elements:
+        # In ascii a number takes a digit and a separator, the last one of the file only a digit.
+        row = 2 * len(element.sizes) if text else sum(element.sizes)
+        if element.count * row > rest + text:
+            fits = 0 if row == 0 else max(rest, 0) // row
+            needed = f"{element.count} rows"
+            if not element.lists and not text:
+                needed += f" ({element.count * row} bytes in binary)"
+            raise InputError(
+                f"{path}: is cut short: element '{element.name}' should hold {needed}, the file ends after "
+                f"{fits} rows ({size} bytes in all); copy or download it again"
+            )
+        rest -= element.count * row
+
+
+def _elements(header: bytes) -> tuple[bool, list[_Element]]:
+    """Whether rows are text, and the elements up to the first line that is not understood."""
+    text, elements = False, list[_Element]()
+    for line in header.decode("ascii", "replace").splitlines():
+        words = line.split()
+        try:
+            if words[:1] == ["format"]:
+                text = words[1] == "ascii"
+            elif words[:1] == ["element"]:
+                elements.append(_Element(words[1], int(words[2])))
+            elif words[:2] == ["property", "list"]:
+                elements[-1].sizes.append(SIZES[words[2]])
+                elements[-1].lists = True
+            elif words[:1] == ["property"]:
+                elements[-1].sizes.append(SIZES[words[1]])
+        except (IndexError, KeyError, ValueError):
+            break
+    return text, [element for element in elements if element.count > 0]

@@ -1,0 +1,67 @@
+"""The frame a scene is fitted in: its cameras around the origin, their extent 1.
+
+Rates, noise and penalties of the reference implementations are stated for scenes of about this size. Fitting in it
+makes the unit and the origin of the capture irrelevant, and keeps single precision for where the cameras are.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from sgwarp.scene import Camera, Gaussians, View
+from sgwarp.scene.extent import camera_extent, near_plane
+
+
+@dataclass(frozen=True, eq=False)
+class Frame:
+    """A similarity: (x - origin) / scale.
+
+    Attributes:
+        origin: In world coordinates, float64 [3].
+        scale: One unit of the frame [world units].
+        near: Near plane of cameras that have the default one [units of the frame], or None to keep it.
+    """
+
+    origin: Tensor
+    scale: float
+    near: float | None
+
+    @classmethod
+    def around(cls, views: Sequence[View]) -> Frame:
+        """The frame of these cameras."""
+        origin = torch.stack([view.camera.position for view in views]).mean(dim=0)
+        scale, near = camera_extent(views), near_plane(views)
+        return cls(origin, scale, None if near is None else near / scale)
+
+    def view(self, view: View) -> View:
+        """A view from the world."""
+        return replace(view, camera=self.camera(view.camera))
+
+    def camera(self, camera: Camera) -> Camera:
+        """A camera from the world."""
+        pose = camera.world_to_camera.clone()
+        pose[:3, 3] = (pose[:3, :3] @ self.origin + pose[:3, 3]) / self.scale
+        chosen = self.near is None or camera.near != Camera.near
+        near = camera.near / self.scale if chosen or self.near is None else self.near
+        return replace(camera, world_to_camera=pose, near=near, far=camera.far / min(self.scale, 1.0))
+
+    def points(self, positions: Any) -> Tensor:
+        """Positions from the world, float64 [N, 3]."""
+        positions = positions if isinstance(positions, Tensor) else torch.from_numpy(np.asarray(positions))
+        return (positions.detach().cpu().to(torch.float64) - self.origin) / self.scale
+
+    def gaussians(self, gaussians: Gaussians) -> Gaussians:
+        """A scene from the world."""
+        means = (gaussians.means.to(torch.float64) - self.origin.to(gaussians.device)) / self.scale
+        return replace(gaussians, means=means.to(torch.float32), scales=gaussians.scales / self.scale)
+
+    def restored(self, gaussians: Gaussians) -> Gaussians:
+        """A scene back into the world."""
+        means = gaussians.means.to(torch.float64) * self.scale + self.origin.to(gaussians.device)
+        return replace(gaussians, means=means.to(torch.float32), scales=gaussians.scales * self.scale)

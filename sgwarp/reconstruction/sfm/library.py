@@ -1,0 +1,87 @@
+"""pycolmap, which is optional: found, silenced, and run where Ctrl-C and a progress bar reach it."""
+
+from __future__ import annotations
+
+import sqlite3
+import threading
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+from sgwarp.errors import InputError
+
+POLL = 0.25  # seconds between two looks at what has been done
+
+
+def require_pycolmap() -> Any:
+    """The library.
+
+    Raises:
+        InputError: It is not installed.
+    """
+    try:
+        import pycolmap
+    except ImportError:
+        raise InputError("structure from motion needs pycolmap; run: pip install 'sgwarp[sfm]'") from None
+    pycolmap.logging.minloglevel = int(pycolmap.logging.FATAL)  # what matters is reported by us, in one line
+    return pycolmap
+
+
+def has_pycolmap() -> bool:
+    """Whether the library is installed."""
+    try:
+        require_pycolmap()
+    except InputError:
+        return False
+    return True
+
+
+def run_cancellable(call: Callable[[Any], Any], watch: Callable[[], None] | None = None) -> Any:
+    """Run a long call of the library in a thread.
+
+    Args:
+        call: Takes the token by which it is canceled.
+        watch: Called four times a second meanwhile, to report progress.
+
+    Raises:
+        KeyboardInterrupt: Ctrl-C was pressed; the call has ended by then, and what it stored remains.
+        Exception: What the call raises.
+    """
+    token = require_pycolmap().CancellationToken()
+    outcome: list[Any] = []
+    failure: list[BaseException] = []
+
+    def work() -> None:
+        try:
+            outcome.append(call(token))
+        except BaseException as error:  # handed on to the caller's thread
+            failure.append(error)
+
+    thread = threading.Thread(target=work, daemon=True)
+    thread.start()
+    try:
+        while thread.is_alive():
+            thread.join(POLL)
+            if watch is not None:
+                watch()
+    except KeyboardInterrupt:
+        token.cancel()
+        thread.join()
+        raise
+    if failure:
+        raise failure[0]
+    return outcome[0]
+
+
+def count_rows(database: Path, table: str) -> int:
+    """Rows of a table of a COLMAP database that another thread may be writing to; 0 where it cannot be read now."""
+    if not database.is_file():
+        return 0
+    try:
+        connection = sqlite3.connect(f"file:{database}?mode=ro", uri=True, timeout=POLL)
+        try:
+            return int(connection.execute(f"SELECT COUNT(*) FROM {table}").fetchone()[0])
+        finally:
+            connection.close()
+    except sqlite3.Error:
+        return 0

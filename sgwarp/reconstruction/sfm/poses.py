@@ -1,0 +1,236 @@
+"""Poses and points of a folder of photographs: COLMAP's incremental mapper, and a report of what it could place."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import logging
+import os
+import shutil
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass, field
+from pathlib import Path
+from typing import Any
+
+from sgwarp.errors import InputError
+from sgwarp.files.access import reading
+from sgwarp.files.atomic import atomic_path
+from sgwarp.io.stems import IMAGE_SUFFIXES
+from sgwarp.reconstruction.sfm.features import SfmSettings, extract_features, match_features, require_photographs
+from sgwarp.reconstruction.sfm.library import require_pycolmap, run_cancellable
+from sgwarp.runs.progress import Report
+
+logger = logging.getLogger("sgwarp")
+MODEL = Path("sparse") / "0"
+NOTES = "sfm.json"
+LEAST_PHOTOGRAPHS = 3
+FEW_FEATURES = 200  # in a photograph: blurred, dark, or of something even
+FEW_MATCHES = 30  # with any other photograph
+LEAST_ANGLE = 4.0  # between the first two photographs where none have COLMAP's 16 [degrees]
+
+
+@dataclass(frozen=True)
+class Registration:
+    """What structure from motion could place.
+
+    Attributes:
+        registered: Names of the photographs with a pose.
+        left_out: Why the others may have none, by name.
+        points: How many.
+        error: Mean reprojection error [pixels].
+    """
+
+    registered: tuple[str, ...]
+    left_out: dict[str, str] = field(default_factory=dict)
+    points: int = 0
+    error: float = float("nan")
+
+    def summary(self) -> str:
+        """One line."""
+        count = len(self.registered)
+        return (
+            f"{count} of {count + len(self.left_out)} photographs have poses; {self.points:,} points, mean "
+            f"reprojection error {self.error:.2f} pixels"
+        )
+
+
+def photographs_in(folder: Path) -> list[str]:
+    """Names of the photographs in a folder and its subfolders, relative to it, in order."""
+    with reading(folder):
+        files = sorted(path for path in folder.rglob("*") if path.suffix in IMAGE_SUFFIXES and path.is_file())
+    return [path.relative_to(folder).as_posix() for path in files]
+
+
+def estimate_poses(
+    folder: Path, out: Path, settings: SfmSettings | None = None, progress: Report | None = None
+) -> Registration:
+    """Find the poses of photographs, and points; write them as a COLMAP model.
+
+    The model goes to `out`/sparse/0, a link to the photographs to `out`/images, and what was found to `out`/sfm.json.
+    A model of the same photographs and settings is kept as it is; an interrupted run goes on where it was. The seed
+    fixes what COLMAP draws at random; with several threads its sums may still differ in the last digits.
+
+    Args:
+        folder: Photographs, also in subfolders.
+        out: Folder to write.
+        settings: Matching, camera, seed.
+        progress: Called as `progress(done, total, text)`.
+
+    Raises:
+        InputError: pycolmap is not installed, there are fewer than 3 photographs, or they do not overlap enough.
+    """
+    pycolmap = require_pycolmap()
+    settings, report = settings or SfmSettings(), progress or (lambda done, total, text: None)
+    names = photographs_in(folder)
+    require_photographs(folder, names, LEAST_PHOTOGRAPHS)
+    out.mkdir(parents=True, exist_ok=True)
+    own = _fingerprint(folder, names, settings)
+    known = _read_notes(out)
+    if known.get("fingerprint") == own and (out / MODEL / "images.bin").is_file():
+        logger.info("%s: holds the poses of these photographs already", out)
+        return Registration(tuple(known["registered"]), known["left_out"], known["points"], known["error"])
+    database = out / "database.db"
+    if known.get("fingerprint") != own:
+        database.unlink(missing_ok=True)
+        _write_notes(out, {"fingerprint": own})
+    pycolmap.set_random_seed(settings.seed)
+    readable = [name for name in names if _readable(folder / name)]
+    extract_features(database, folder, readable, settings, report)
+    match_features(database, len(readable), settings, report)
+    model = _map(database, folder, out, settings, len(readable), report)
+    found = Registration(
+        tuple(sorted(model.image(number).name for number in model.reg_image_ids())),
+        {},
+        model.num_points3D(),
+        float(model.compute_mean_reprojection_error()),
+    )
+    found.left_out.update(_reasons(database, names, readable, found.registered))
+    _keep(model, folder, out)
+    _write_notes(out, {"fingerprint": own, **asdict(found)})
+    database.unlink(missing_ok=True)
+    return found
+
+
+def _readable(path: Path) -> bool:
+    from sgwarp.files.images import read_size
+
+    try:
+        read_size(path)
+    except InputError:
+        return False
+    return True
+
+
+def _map(database: Path, folder: Path, out: Path, settings: SfmSettings, count: int, report: Report) -> Any:
+    """The largest model that COLMAP can make."""
+    options = require_pycolmap().IncrementalPipelineOptions()
+    options.random_seed, options.num_threads = settings.seed, settings.threads
+    options.min_model_size = LEAST_PHOTOGRAPHS
+    work = out / "mapping"
+    models = _attempt(database, folder, work, options, count, report)
+    if not models:
+        options.mapper.init_min_tri_angle = LEAST_ANGLE
+        options.mapper.init_min_num_inliers = FEW_MATCHES
+        models = _attempt(database, folder, work, options, count, report)
+    if not models:
+        raise InputError(
+            f"{folder}: no two photographs overlap enough to place them; take more of them, closer together, sharp, "
+            "and of something that is not even or shiny"
+        )
+    ordered = sorted(models.values(), key=lambda model: model.num_reg_images(), reverse=True)
+    if len(ordered) > 1:
+        others = ", ".join(str(model.num_reg_images()) for model in ordered[1:])
+        logger.warning(
+            "%s: falls into %d parts that could not be joined; the largest is used (%d photographs; others: %s)",
+            *(folder, len(ordered), ordered[0].num_reg_images(), others),
+        )
+    return ordered[0]
+
+
+def _attempt(database: Path, folder: Path, work: Path, options: Any, count: int, report: Report) -> Any:
+    """Models by number; none if no two photographs can be placed."""
+    pycolmap = require_pycolmap()
+    shutil.rmtree(work, ignore_errors=True)
+    work.mkdir()
+    placed = 2
+
+    def note() -> None:
+        nonlocal placed
+        placed += 1
+
+    def run(token: Any) -> Any:
+        return pycolmap.incremental_mapping(
+            database, folder, work, options=options, next_image_callback=note, cancellation_token=token
+        )
+
+    models = run_cancellable(run, lambda: report(min(placed, count), count, "placing photographs"))
+    shutil.rmtree(work, ignore_errors=True)
+    return models
+
+
+def _reasons(
+    database: Path, names: Sequence[str], readable: Sequence[str], registered: Sequence[str]
+) -> dict[str, str]:
+    """Why photographs have no pose, as far as the database tells."""
+    pycolmap = require_pycolmap()
+    reasons = {name: "cannot be read" for name in set(names) - set(readable)}
+    data = pycolmap.Database.open(database)
+    images = {image.name: image.image_id for image in data.read_all_images()}
+    best: dict[int, int] = {}
+    for pair, geometry in zip(*data.read_two_view_geometries(), strict=True):
+        for number in pycolmap.pair_id_to_image_pair(pair):
+            best[number] = max(best.get(number, 0), len(geometry.inlier_matches))
+    for name in set(readable) - set(registered):
+        number = images.get(name, 0)
+        features = data.num_keypoints_for_image(number) if number else 0
+        if features < FEW_FEATURES:
+            reasons[name] = f"only {features} features: blurred, dark, or of something even"
+        elif best.get(number, 0) < FEW_MATCHES:
+            reasons[name] = "overlaps no other photograph enough"
+        else:
+            reasons[name] = "overlaps others, but shows too few of the points that they have in common"
+    data.close()
+    return dict(sorted(reasons.items()))
+
+
+def _keep(model: Any, folder: Path, out: Path) -> None:
+    """Write the model whole or not at all, and link the photographs."""
+    whole, target = out / "whole", out / MODEL
+    shutil.rmtree(whole, ignore_errors=True)
+    whole.mkdir()
+    model.write_binary(str(whole))
+    shutil.rmtree(target, ignore_errors=True)
+    target.parent.mkdir(exist_ok=True)
+    os.replace(whole, target)
+    link = out / "images"
+    if link.is_symlink():
+        link.unlink()
+    if link.exists():
+        return  # frames of a video
+    try:
+        link.symlink_to(folder.resolve(), target_is_directory=True)
+    except OSError:
+        logger.warning("%s: cannot be made a link to the photographs; name them with --images %s", link, folder)
+
+
+def _fingerprint(folder: Path, names: Sequence[str], settings: SfmSettings) -> str:
+    """Of names, sizes and times of the files, and of the settings."""
+    digest = hashlib.sha256(repr((settings.matching, settings.one_camera, settings.camera_model)).encode())
+    digest.update(repr(settings.seed).encode())
+    for name in names:
+        facts = (folder / name).stat()
+        digest.update(f"{name} {facts.st_size} {facts.st_mtime_ns}\n".encode())
+    return digest.hexdigest()[:16]
+
+
+def _read_notes(out: Path) -> dict[str, Any]:
+    try:
+        notes = json.loads((out / NOTES).read_text(encoding="utf-8"))
+    except (OSError, ValueError):
+        return {}
+    return notes if isinstance(notes, dict) else {}
+
+
+def _write_notes(out: Path, notes: dict[str, Any]) -> None:
+    with atomic_path(out / NOTES) as temporary:
+        temporary.write_text(json.dumps(notes, indent=1) + "\n", encoding="utf-8")

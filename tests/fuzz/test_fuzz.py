@@ -1,0 +1,97 @@
+"""A short run of the fuzzer, and the files that it has found over the years."""
+
+import base64
+import json
+import random
+import signal
+from pathlib import Path
+
+import pytest
+
+CORPUS = json.loads((Path(__file__).with_name("corpus.json")).read_text())
+SECONDS = 10.0
+
+
+@pytest.fixture(scope="module")
+def pairs(tmp_path_factory):
+    import fuzzer
+    from fuzz_readers import readers
+
+    made = readers(tmp_path_factory.mktemp("fuzz"))
+    fuzzer.require_good(made)
+    return made
+
+
+@pytest.fixture
+def alarm():
+    """The fuzzer's handlers of signals, taken back afterwards."""
+    import fuzzer
+
+    before = [signal.signal(number, fuzzer._ring) for number in (signal.SIGALRM, signal.SIGPROF)]
+    yield fuzzer
+    for number, handler in zip((signal.SIGALRM, signal.SIGPROF), before, strict=True):
+        signal.signal(number, handler)
+
+
+@pytest.mark.filterwarnings("ignore")
+def test_nothing_but_input_errors(pairs, alarm):
+    """The rule, on as many inputs as ten seconds allow; `make fuzz` runs a million."""
+    before = random.getstate()
+    results = alarm.fuzz(pairs, 10**6, SECONDS, seed=0)
+    bad = {
+        name: {what: n for what, n in counts.items() if what not in ("read", "refused")}
+        for name, counts in results.items()
+    }
+    assert not {name: found for name, found in bad.items() if found}
+    assert min(counts.total() for counts in results.values()) > 3
+    assert random.getstate() == before
+
+
+@pytest.mark.filterwarnings("ignore")
+@pytest.mark.parametrize("number", range(len(CORPUS)))
+def test_what_was_found_stays_mended(pairs, alarm, number):
+    entry = CORPUS[number]
+    reader = next(reader for reader in pairs if reader.name == entry["reader"])
+    original = reader.file.read_bytes()
+    try:
+        assert alarm.check(reader, base64.b64decode(entry["file"]), alarm.Memory()) in ("read", "refused")
+    finally:
+        reader.file.write_bytes(original)
+
+
+def test_the_fuzzer_sees_what_is_wrong(tmp_path, alarm):
+    """Each fault that it looks for, made on purpose."""
+    from fuzz_readers import Reader
+
+    from sgwarp.errors import InputError
+
+    kept = []
+
+    def raw():
+        raise KeyError("x")
+
+    def slow():
+        while True:
+            pass
+
+    def greedy():
+        kept.append(bytearray(b"x") * (200 * 2**20))
+
+    def unclear():
+        error = InputError("x")
+        error.args = ("two\nlines",)
+        raise error
+
+    def refused():
+        raise InputError("x")
+
+    for read, wanted in (
+        (raw, "KeyError in test_fuzz"),
+        (slow, "took over 2 s"),
+        (unclear, "a message"),
+        (refused, "refused"),
+    ):
+        assert alarm.check(Reader("a", tmp_path / "a", read), b"x").startswith(wanted)
+    memory = alarm.Memory()
+    if memory.able:
+        assert alarm.check(Reader("a", tmp_path / "a", greedy), b"x", memory) == "took over 192 MB"
