@@ -19,7 +19,7 @@ FLOORS = (
     ("io", "metrics", "ops", "visualization"),
     ("compat", "datasets", "encoders", "rendering"),
     ("lifting", "network", "reconstruction"),
-    ("querying",),
+    ("fitting", "querying"),
     ("apps",),
     ("cluster", "evaluation", "viewer"),
     ("demo",),

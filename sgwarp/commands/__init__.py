@@ -3,6 +3,7 @@
 Only `sgwarp.cli` imports this package, once tyro is known to be there; torch and warp come with `run`.
 """
 
+from sgwarp.commands.convert import Convert
 from sgwarp.commands.demo import Demo
 from sgwarp.commands.distill import Distill
 from sgwarp.commands.encoders import Encoders
@@ -28,6 +29,7 @@ COMMANDS = {
     "track": Track,
     "render": Render,
     "info": Info,
+    "convert": Convert,
     "encoders": Encoders,
     "report": Report,
     "demo": Demo,

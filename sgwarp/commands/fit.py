@@ -82,7 +82,8 @@ class Fit(Options):
     """Folder of depth along the optical axis: {stem}.png in millimetres or {stem}.npy in metres, 0 for none."""
 
     masks: Path | None = None
-    """Folder of {stem}.png; what is black there does not count."""
+    """Folder of {stem}.png, or of folders and names as the photographs'; what is black there does not count. If not
+    given, the masks that the data set names; none for none at all."""
 
     exposure: bool = False
     """Also fit an affine map of the colours for every photograph."""
@@ -111,7 +112,7 @@ class Fit(Options):
         if self.hold_out < 0:
             raise InputError(f"--hold-out: expected 0 or more, got {self.hold_out}")
         with self.logged(self.out.parent) as log:
-            from sgwarp.reconstruction.fitting.photographs import masks_from_folder, require_enough
+            from sgwarp.reconstruction.fitting.photographs import require_enough
             from sgwarp.reconstruction.fitting.settings import FitSettings
             from sgwarp.reconstruction.fitting.trainer import fit
 
@@ -132,7 +133,7 @@ class Fit(Options):
                 evaluate_every=min(EVALUATE_EVERY, max(1, self.steps // 10)),
                 degree_every=min(DEGREE_EVERY, max(1, self.steps // (self.sh_degree + 1))),
             )
-            masks = masks_from_folder(self.masks, views) if self.masks is not None else None
+            masks = self._masks(views)
             start = self._start(source, kept, settings, log)
             checkpoint = self.out.with_name(f"{self.out.name}.checkpoint")
             with show_progress("fit") as progress:
@@ -157,6 +158,14 @@ class Fit(Options):
                 checkpoint.unlink(missing_ok=True)
         if not fitted.complete:
             raise KeyboardInterrupt
+
+    def _masks(self, views: list[View]) -> Masks | None:
+        """Masks that were given, or that the data set names."""
+        from sgwarp.reconstruction.fitting.belongings import masks_from_folder, masks_of_views
+
+        if self.masks is None:
+            return masks_of_views(views)
+        return None if str(self.masks) == "none" else masks_from_folder(self.masks, views)
 
     def _posed(self, log: RunLog) -> Path:
         """The data set: what was given, or what structure from motion makes of it."""
@@ -191,7 +200,7 @@ class Fit(Options):
                 from sgwarp.reconstruction.fitting.initial import depth_from_folder
 
                 assert self.depth is not None
-                return gaussians_from_depth(views, depth_from_folder(self.depth), count=settings.cap)
+                return gaussians_from_depth(views, depth_from_folder(self.depth, views), count=settings.cap)
             if self.init in ("auto", "points") and (points := self._points(source)) is not None:
                 return points
             return self._triangulated(views, log)

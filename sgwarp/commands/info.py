@@ -35,7 +35,10 @@ class Info(SceneOptions):
             self._show(self._sequence_facts())
             return
         gaussians = self.load_scene(log)
-        facts: dict[str, Any] = {"scene": str(self.scene), **scene_facts(gaussians)}
+        from sgwarp.io.scenes import find_format
+
+        form = find_format(self.scene)
+        facts: dict[str, Any] = {"scene": str(self.scene), "format": form.name, **scene_facts(gaussians)}
         if self.semantics is not None:
             facts["semantics"] = semantics_facts(self.semantics, gaussians)
         self._show(facts)
@@ -71,6 +74,7 @@ def scene_facts(gaussians: Gaussians) -> dict[str, Any]:
         "non_finite_rows": gaussians.non_finite,
         "opacity_histogram": torch.histc(kept.opacities.cpu(), bins=BINS, min=0.0, max=1.0).int().tolist(),
         "fingerprint": gaussians.fingerprint,
+        "other_columns": sorted(gaussians.extras) if gaussians.extras else None,
     }
 
 

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
-from sgwarp.commands.options import SceneOptions, check_name, find_views
+from sgwarp.commands.options import SceneOptions, check_name, find_views, place_views
 from sgwarp.runs.progress import show_progress
 
 if TYPE_CHECKING:
@@ -20,6 +20,10 @@ class Lift(SceneOptions):
 
     views: Path
     """Posed photographs: a folder with transforms.json or a COLMAP model."""
+
+    transform: Path | None = None
+    """Where the views lie in another world than the scene: the transform between them, such as the
+    dataparser_transforms.json of the trainer that moved the scene."""
 
     out: Path
     """Semantics file to write, .safetensors; run.json goes beside it."""
@@ -71,6 +75,8 @@ class Lift(SceneOptions):
                 notes: dict[str, Any] = {"encoder": self.encoder}
             else:
                 views = find_views(self.views, photographs=self.photographs, images=self.images)
+                with log.stage("compare"):
+                    views = place_views(gaussians, self.scene, views, self.transform)
                 semantics = self._lift(gaussians, views, log)
                 notes = {"encoder": self.encoder, "mode": self.mode, "views": len(views)}
             with log.stage("write"):

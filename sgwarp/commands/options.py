@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 import os
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -64,7 +65,11 @@ class Options:
 @dataclass(kw_only=True)
 class SceneOptions(Options):
     scene: tyro.conf.Positional[Path]
-    """The trained scene, a .ply file."""
+    """The trained scene: .ply, .spz, .splat, .glb or .sog."""
+
+    axes: str | None = None
+    """Directions of the scene file's axes x, y, z, such as rdf or rub; if not given, what its format says: rdf for
+    .ply, .splat and .sog, rub for .spz, luf for .glb."""
 
     def load_scene(self, log: RunLog) -> Gaussians:
         """The scene on the chosen device.
@@ -75,7 +80,7 @@ class SceneOptions(Options):
         from sgwarp.io.scenes import load_gaussians
 
         with log.stage("read"):
-            gaussians = load_gaussians(self.scene).to(self.device)
+            gaussians = load_gaussians(self.scene, self.axes).to(self.device)
         if not len(gaussians):
             raise InputError(f"{self.scene}: holds no Gaussians")
         return gaussians
@@ -171,6 +176,31 @@ def find_views(
         some = ", ".join(view.stem for view in views[:5])
         raise InputError(f"{folder}: has no view '{stem}'; its {len(views)} views are named {some}, ...")
     return chosen
+
+
+def place_views(gaussians: Gaussians, scene: Path, views: list[View], transform: Path | None) -> list[View]:
+    """The views in the world of the scene; says so where their photographs do not match it.
+
+    Raises:
+        InputError: The transform cannot be read.
+    """
+    from sgwarp.io.world_transforms import moved_views
+    from sgwarp.rendering.agreement import find_placement
+
+    matrix = find_placement(gaussians, scene, views, transform)
+    return views if matrix is None else moved_views(views, matrix)
+
+
+@contextmanager
+def notices_held_back() -> Iterator[None]:
+    """Log nothing in the block."""
+    logger = logging.getLogger("sgwarp")
+    before = logger.disabled
+    logger.disabled = True
+    try:
+        yield
+    finally:
+        logger.disabled = before
 
 
 def photograph(gaussians: Gaussians, view: View) -> Tensor:

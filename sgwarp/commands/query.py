@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Literal
 
-from sgwarp.commands.options import SemanticsOptions, check_name, find_views, photograph
+from sgwarp.commands.options import SemanticsOptions, check_name, find_views, photograph, place_views
 from sgwarp.errors import InputError
 
 if TYPE_CHECKING:
@@ -22,6 +22,10 @@ class Query(SemanticsOptions):
 
     views: Path
     """Posed photographs: a folder with transforms.json or a COLMAP model."""
+
+    transform: Path | None = None
+    """Where the views lie in another world than the scene: the transform between them, such as the
+    dataparser_transforms.json of the trainer that moved the scene."""
 
     text: str
     """What to look for; for semantics lifted from label images, one of their labels."""
@@ -62,7 +66,8 @@ class Query(SemanticsOptions):
 
             gaussians, semantics = self.load_both(log)
             predicted = self.load_predicted(gaussians, log)
-            (view,) = find_views(self.views, self.view, images=self.images)
+            views = find_views(self.views, self.view, images=self.images)
+            (view,) = place_views(gaussians, self.scene, views, self.transform)
             scores = self._scores(semantics, predicted, log)
             with log.stage("splat"):
                 (x, y), score_map = localize(

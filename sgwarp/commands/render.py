@@ -6,7 +6,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Literal
 
-from sgwarp.commands.options import SceneOptions, check_folder, find_views
+from sgwarp.commands.options import SceneOptions, check_folder, find_views, notices_held_back
 from sgwarp.errors import InputError
 from sgwarp.runs.progress import show_progress
 
@@ -26,6 +26,10 @@ class Render(SceneOptions):
 
     views: Path | None = None
     """Cameras: a folder with transforms.json or a COLMAP model. The photographs need not be there."""
+
+    transform: Path | None = None
+    """Where the views lie in another world than the scene: the transform between them, such as the
+    dataparser_transforms.json of the trainer that moved the scene."""
 
     view: str | None = None
     """Only the view of this name."""
@@ -77,10 +81,25 @@ class Render(SceneOptions):
 
             return orbit_views(gaussians, self.frames, *self.size, up=self.up)
         try:
-            return find_views(self.views, self.view, photographs=False)
+            views = find_views(self.views, self.view, photographs=False)
         except InputError:
             # A file that gives no image size needs the photographs after all; else this fails for the same reason.
-            return find_views(self.views, self.view, images=self.images)
+            views = find_views(self.views, self.view, images=self.images)
+        return self._placed(gaussians, views)
+
+    def _placed(self, gaussians: Gaussians, views: list[View]) -> list[View]:
+        """The views in the world of the scene; compared with their photographs, if these are there."""
+        from sgwarp.io.world_transforms import moved_views
+        from sgwarp.rendering.agreement import find_placement
+
+        assert self.views is not None
+        try:
+            with notices_held_back():  # those of the same views have been shown
+                compared = find_views(self.views, self.view, images=self.images)
+        except InputError:
+            compared = views
+        matrix = find_placement(gaussians, self.scene, compared, self.transform)
+        return views if matrix is None else moved_views(views, matrix)
 
     def _write(self, path: Path, image: Tensor) -> list[str]:
         """The picture, and for depth the numbers; returns their paths."""

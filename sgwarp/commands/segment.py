@@ -6,7 +6,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Literal
 
-from sgwarp.commands.options import SemanticsOptions, check_folder, find_views, photograph
+from sgwarp.commands.options import SemanticsOptions, check_folder, find_views, photograph, place_views
 from sgwarp.errors import InputError
 from sgwarp.runs.progress import show_progress
 
@@ -22,6 +22,10 @@ class Segment(SemanticsOptions):
 
     views: Path
     """Posed photographs: a folder with transforms.json or a COLMAP model."""
+
+    transform: Path | None = None
+    """Where the views lie in another world than the scene: the transform between them, such as the
+    dataparser_transforms.json of the trainer that moved the scene."""
 
     out: Path
     """Folder for {stem}.png, the index in the list of classes per pixel, 255 where unknown; and overlays/{stem}.png."""
@@ -58,6 +62,7 @@ class Segment(SemanticsOptions):
             gaussians, semantics = self.load_both(log)
             predicted = self.load_predicted(gaussians, log)
             views = find_views(self.views, self.view, images=self.images)
+            views = place_views(gaussians, self.scene, views, self.transform)
             encoder = None
             if classes is not None and semantics.labels is None:
                 with log.stage("load_encoder"):

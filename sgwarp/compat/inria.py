@@ -1,7 +1,8 @@
 """Inria's rasterizer (diff-gaussian-rasterization) and neighbour distances (simple-knn), on the CPU as on CUDA.
 
-Names, arguments, transposed matrices, thresholds (near plane 0.2, opacity clamped at 0.99) and the two return values
-are Inria's. What differs: a footprint ends where it falls below 1/255 instead of at the tiles of three standard
+Names, arguments, transposed matrices, thresholds (near plane 0.2, opacity clamped at 0.99) and the return values are
+Inria's: image and radii; with settings that say whether to antialias, as they do since October 2024, also the inverse
+depth. What differs: a footprint ends where it falls below 1/255 instead of at the tiles of three standard
 deviations, the principal point may lie off the image's centre, Gaussians that are not finite are left out.
 """
 
@@ -13,6 +14,7 @@ from typing import Any, NamedTuple
 import torch
 from torch import Tensor
 
+from sgwarp.compat.gsplat.checks import widen
 from sgwarp.errors import InputError
 from sgwarp.ops.neighbors import mean_squared_neighbor_distance
 from sgwarp.ops.planar.harmonics import harmonics_sum
@@ -47,7 +49,8 @@ class GaussianRasterizationSettings(NamedTuple):
         sh_degree: Degree of spherical harmonics to use.
         campos: Camera centre in the world [m], [3].
         prefiltered, debug: Accepted; they change nothing here.
-        antialiasing: Scale opacities by the area that the low-pass filter added.
+        antialiasing: Scale opacities by the area that the low-pass filter added. None, for code from before October
+            2024, which does not give it, is False, and the rasterizer then returns two values instead of three.
     """
 
     image_height: int
@@ -62,7 +65,7 @@ class GaussianRasterizationSettings(NamedTuple):
     campos: Tensor
     prefiltered: bool = False
     debug: bool = False
-    antialiasing: bool = False
+    antialiasing: bool | None = None
 
 
 class GaussianRasterizer(torch.nn.Module):
@@ -89,7 +92,8 @@ class GaussianRasterizer(torch.nn.Module):
         scales: Tensor | None = None,
         rotations: Tensor | None = None,
         cov3D_precomp: Tensor | None = None,
-    ) -> tuple[Tensor, Tensor]:
+        dc: Tensor | None = None,
+    ) -> tuple[Tensor, ...]:
         """Render.
 
         Args:
@@ -101,20 +105,26 @@ class GaussianRasterizer(torch.nn.Module):
             colors_precomp: Any number of channels, [N, C].
             scales, rotations: Standard deviations [m], [N, 3], and (w, x, y, z), [N, 4]; or:
             cov3D_precomp: Upper triangles of covariances [m^2], [N, 6].
+            dc: The coefficients of degree 0, [N, 1, 3]; `shs` then holds those above, [N, K - 1, 3].
 
         Returns:
-            Image [C, H, W] and, without gradient, radii: three standard deviations along the longer axis, rounded up
-            [pixels], int32 [N], zero for what is not seen.
+            Image [C, H, W]; without gradient, radii: three standard deviations along the longer axis, rounded up
+            [pixels], int32 [N], zero for what is not seen; and, if the settings say whether to antialias, the inverse
+            depth: the sum of alpha T / z [1 / m], [1, H, W].
 
         Raises:
             InputError: Naming the argument that does not fit, or a projection that is no pinhole camera.
         """
         settings = self.raster_settings
+        means3D, means2D, opacities, shs, dc = widen(means3D, means2D, opacities, shs, dc)
+        colors_precomp, scales, rotations, cov3D_precomp = widen(colors_precomp, scales, rotations, cov3D_precomp)
+        if dc is not None:
+            shs = _joined(dc, shs, len(means3D))
         _check(means3D, means2D, opacities, shs, colors_precomp, scales, rotations, cov3D_precomp, settings)
         width, height = int(settings.image_width), int(settings.image_height)
         opacities = opacities.reshape(-1)
         projection = ProjectionSettings(
-            near=NEAR, far=math.inf, compensated=settings.antialiasing, min_area_ratio=MIN_AREA_RATIO
+            near=NEAR, far=math.inf, compensated=bool(settings.antialiasing), min_area_ratio=MIN_AREA_RATIO
         )
         viewmat = settings.viewmatrix.to(means3D.device).T
         K = _intrinsics(settings)
@@ -144,10 +154,63 @@ class GaussianRasterizer(torch.nn.Module):
         else:
             directions = select_rows(means3D, p.index) - settings.campos.to(means3D)
             values = (harmonics_sum(directions, select_rows(shs, p.index), settings.sh_degree) + 0.5).clamp(min=0.0)
+        channels, wants_depth = values.shape[1], settings.antialiasing is not None
+        if wants_depth:
+            values = torch.cat([values, 1.0 / p.depths[:, None]], dim=1)
         job = SplatJob(width, height, RasterSettings(alpha_max=ALPHA_MAX))
-        image, transmittance, _ = composite_splats(centres, p.factors, opacity, values, p.depths, job)
-        image = image + transmittance[..., None] * settings.bg.to(image)
-        return image.permute(2, 0, 1).contiguous(), _radii(p, len(means3D))
+        layers, transmittance, _ = composite_splats(centres, p.factors, opacity, values, p.depths, job)
+        image = layers[..., :channels] + transmittance[..., None] * settings.bg.to(layers)
+        found = image.permute(2, 0, 1).contiguous(), _radii(p, len(means3D))
+        return (*found, layers[..., channels:].permute(2, 0, 1).contiguous()) if wants_depth else found
+
+
+class SparseGaussianAdam(torch.optim.Adam):
+    """Adam that moves only the Gaussians that were seen, as the one in Inria's rasterizer since October 2024 does.
+
+    Moments have no bias correction, and rows that were not seen keep theirs. Each group of parameters holds one tensor.
+
+    Args:
+        params: Groups as for torch.optim.Adam.
+        lr: Rate of groups that have none of their own.
+        eps: Added to the root of the second moment.
+    """
+
+    def __init__(self, params: Any, lr: float, eps: float) -> None:
+        super().__init__(params=params, lr=lr, eps=eps)
+
+    @torch.no_grad()
+    def step(self, visibility: Tensor, N: int) -> None:  # type: ignore[override]
+        """Update the rows of the visible Gaussians.
+
+        Args:
+            visibility: Which were seen, bool [N]; radii > 0.
+            N: How many Gaussians there are; every parameter has N rows.
+
+        Raises:
+            InputError: A group holds several tensors, or a tensor has another number of rows.
+        """
+        seen = visibility.reshape(-1).to(torch.bool)
+        for group in self.param_groups:
+            (parameter, *others) = group["params"]
+            if others or len(parameter) != N or len(seen) != N:
+                raise InputError(
+                    f"SparseGaussianAdam: expected one tensor of {N} rows in each group, and visibility [{N}]; got "
+                    f"{1 + len(others)} tensors, {len(parameter)} rows, visibility [{len(seen)}]"
+                )
+            if parameter.grad is None:
+                continue
+            state = self.state[parameter]
+            if not state:
+                state["step"] = torch.tensor(0.0)
+                state["exp_avg"], state["exp_avg_sq"] = torch.zeros_like(parameter), torch.zeros_like(parameter)
+            rows = seen.nonzero().flatten().to(parameter.device)
+            gradient = parameter.grad[rows]
+            beta1, beta2 = group["betas"]
+            first = state["exp_avg"][rows] * beta1 + (1 - beta1) * gradient
+            second = state["exp_avg_sq"][rows] * beta2 + (1 - beta2) * gradient**2
+            state["exp_avg"][rows], state["exp_avg_sq"][rows] = first, second
+            state["step"] += 1
+            parameter[rows] -= group["lr"] * first / (second.sqrt() + group["eps"])
 
 
 @isolated
@@ -209,6 +272,17 @@ def _check(
             raise InputError(f"shs: expected [{n}, at least {count}, 3] for sh_degree {settings.sh_degree}")
     if tuple(settings.bg.shape) != (channels,):
         raise InputError(f"bg: expected shape [{channels}], got {list(settings.bg.shape)}")
+
+
+def _joined(dc: Tensor, shs: Tensor | None, count: int) -> Tensor:
+    """Harmonics [N, K, 3] of the coefficients of degree 0 and of those above."""
+    if tuple(dc.shape) != (count, 1, 3):
+        raise InputError(f"dc: expected shape [{count}, 1, 3], got {list(dc.shape)}")
+    if shs is None:
+        return dc
+    if shs.ndim != 3 or len(shs) != count or shs.shape[2] != 3:
+        raise InputError(f"shs: expected shape [{count}, K - 1, 3] beside dc, got {list(shs.shape)}")
+    return torch.cat([dc, shs], dim=1)
 
 
 def _intrinsics(settings: GaussianRasterizationSettings) -> Tensor:

@@ -195,7 +195,7 @@ KINDS = (
         "DIR",
         "files:features?layout=chw",
         "",
-        {"layout": "text", "levels": "text"},
+        {"layout": "text", "levels": "text", "straight": "text"},
         make="sgwarp.encoders.maps.files:make_source",
     ),
     Kind(

@@ -11,23 +11,27 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sgwarp.errors import InputError
-from sgwarp.files.images import read_size
-from sgwarp.io.colmap_model import ImageRecord, find_model, read_cameras, read_images
+from sgwarp.files.exif import UPRIGHT
+from sgwarp.io.colmap_model import ImageRecord, count_images, find_model, find_models, read_cameras, read_images
 from sgwarp.io.colmap_model import read_points as read_points
 from sgwarp.io.image_folders import find_image_folder
 from sgwarp.io.names import inside
+from sgwarp.io.photographs import LeftOut, fit_photograph, say_orientations
 from sgwarp.io.stems import unique_stems
-from sgwarp.io.undistort import Lens, pinhole_view
+from sgwarp.io.undistort import Lens, Listed, pinhole_view
 from sgwarp.scene import View
+
+MISSING, UNPOSED = "without photograph", "whose pose holds NaN or infinity"
 
 
 def read_colmap(path: str | os.PathLike[str], image_folder: str | None = None, photographs: bool = True) -> list[View]:
     """Read the registered images of a COLMAP reconstruction, sorted by name.
 
     Distorted photographs are undistorted when read (`View.undistort`), and the camera is that of the undistorted
-    image. If the photographs are an integer factor smaller than the model says (images_2, images_4, images_8 of
-    Mip-NeRF 360), the camera follows them. Photographs that do not exist and poses with NaN or infinity are left out,
-    with a logged notice of how many.
+    image. If the photographs are smaller or larger than the model says (images_2, images_4, images_8 of Mip-NeRF 360),
+    the camera follows them. A photograph that fits its camera only when it is turned as its EXIF data say is turned.
+    Photographs that do not exist or do not fit, poses with NaN or infinity and cameras of unsupported models are left
+    out, with a logged notice of how many. Of several models the one with most images is read.
 
     Args:
         path: The data set (with sparse/0, sparse or colmap/sparse/0) or the folder of the model itself.
@@ -36,62 +40,76 @@ def read_colmap(path: str | os.PathLike[str], image_folder: str | None = None, p
         photographs: False to take the cameras alone; then no photograph is looked for.
 
     Raises:
-        InputError: The model is missing or damaged, a camera model is not supported, photographs and cameras differ
-            in size, or no view is left.
+        InputError: The model is missing or damaged, or no view is left.
     """
     path = Path(path)
     model = find_model(path)
     if model is None:
         raise InputError(f"{path}: holds no COLMAP model (cameras.bin or cameras.txt in sparse/0, sparse or itself)")
+    _say_models(path, model)
     lenses = read_cameras(model)
     records = read_images(model)
     folder = find_image_folder(model, [record.name for record in records], image_folder) if photographs else None
-    kept: list[tuple[ImageRecord, NDArray[np.float64], Path | None]] = []
-    missing: list[str] = []
-    unposed = 0
-    for record in records:
-        if record.camera_id not in lenses:
-            raise InputError(f"{model}: image {record.name!r} refers to camera {record.camera_id}, which is not listed")
+    left_out = LeftOut(model, "images")
+    kept = [record for record in records if _usable(record, lenses, folder, left_out)]
+    views, used = [], []
+    for stem, record in zip(unique_stems(model, [record.name for record in kept]), kept, strict=True):
         image = inside(model, folder, record.name) if folder is not None else None
-        pose = _world_to_camera(record)
-        if image is not None and not os.path.isfile(image):
-            missing.append(record.name)
-        elif pose is None:
-            unposed += 1
-        else:
-            kept.append((record, pose, image))
-    log = logging.getLogger("sgwarp")
-    if missing:
-        log.warning("%s: left out %d images without photograph, first %r", model, len(missing), missing[0])
-    if unposed:
-        log.warning("%s: left out %d images whose pose holds NaN or infinity", model, unposed)
-    if not kept:
-        raise InputError(
-            f"{model}: none of {len(records)} registered images can be used: {len(missing)} photographs are not in "
-            f"{folder}, {unposed} poses hold NaN or infinity"
-        )
-    views = []
-    for stem, (record, pose, image) in zip(unique_stems(model, [r.name for r, _, _ in kept]), kept, strict=True):
-        lens = lenses[record.camera_id]
+        lens, pose, orientation = lenses[record.camera_id], _world_to_camera(record), UPRIGHT
+        assert isinstance(lens, Lens)
+        assert pose is not None
+        try:
+            if image is not None:
+                lens, orientation = fit_photograph(lens, image)
+            listed = Listed(record.name, image, orientation)
+            views.append(pinhole_view(f"{model}: image {record.name!r}", stem, lens, pose, listed))
+        except InputError as error:
+            left_out.fail(error, record.name)
+            continue
         if image is not None:
-            lens = _fitted(lens, image)
-        views.append(pinhole_view(f"{model}: image {record.name!r}", stem, lens, pose, image))
+            used.append((image, orientation))
+    if not views:
+        raise InputError(
+            left_out.first_error
+            or f"{model}: none of {len(records)} registered images can be used: {left_out.count(MISSING)} photographs "
+            f"are not in {folder}, {left_out.count(UNPOSED)} poses hold NaN or infinity"
+        )
+    left_out.say()
+    say_orientations(model, used)
     return views
 
 
-def _fitted(lens: Lens, image: Path) -> Lens:
-    """The lens for photographs that may be an integer factor smaller than the model says."""
-    height, width = read_size(image)
-    if (height, width) == (lens.height, lens.width):
-        return lens
-    factor = max(1, round(lens.width / width))
-    # Tools round the smaller size up or down.
-    if max(abs(lens.width / factor - width), abs(lens.height / factor - height)) >= 1:
+def _usable(record: ImageRecord, lenses: dict[int, Lens | InputError], folder: Path | None, left_out: LeftOut) -> bool:
+    """Whether an image has a camera, a pose and a photograph; if not, why is noted.
+
+    Raises:
+        InputError: It refers to a camera that is not listed, or to a file outside the folder of photographs.
+    """
+    if record.camera_id not in lenses:
         raise InputError(
-            f"{image}: image is {width} x {height}, its camera says {lens.width} x {lens.height}, which is no integer "
-            "factor; resize one of them"
+            f"{left_out.source}: image {record.name!r} refers to camera {record.camera_id}, which is not listed"
         )
-    return lens.resized(width, height)
+    lens = lenses[record.camera_id]
+    if folder is not None and not os.path.isfile(inside(left_out.source, folder, record.name)):
+        left_out.add(MISSING, record.name)
+    elif _world_to_camera(record) is None:
+        left_out.add(UNPOSED, record.name)
+    elif isinstance(lens, InputError):
+        left_out.fail(lens, record.name)
+    else:
+        return True
+    return False
+
+
+def _say_models(path: Path, model: Path) -> None:
+    """Log which of several models is read."""
+    models = find_models(path)
+    if len(models) > 1:
+        sizes = ", ".join(f"{other.name} with {count_images(other)}" for other in models)
+        logging.getLogger("sgwarp").warning(
+            "%s: holds %d models (%s images); the one with most images is read, %s",
+            *(path, len(models), sizes, model.name),
+        )
 
 
 def _world_to_camera(record: ImageRecord) -> NDArray[np.float64] | None:

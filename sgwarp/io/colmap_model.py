@@ -14,35 +14,17 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sgwarp.errors import InputError
-from sgwarp.files.access import read_bytes
+from sgwarp.files.access import read_bytes, reading
+from sgwarp.io.lens_models import COLMAP_MODELS
 from sgwarp.io.undistort import Lens
 
-# Number in the binary format -> name and number of parameters.
-MODELS = {
-    0: ("SIMPLE_PINHOLE", 3),
-    1: ("PINHOLE", 4),
-    2: ("SIMPLE_RADIAL", 4),
-    3: ("RADIAL", 5),
-    4: ("OPENCV", 8),
-    5: ("OPENCV_FISHEYE", 8),
-    6: ("FULL_OPENCV", 12),
-    7: ("FOV", 5),
-    8: ("SIMPLE_RADIAL_FISHEYE", 4),
-    9: ("RADIAL_FISHEYE", 5),
-    10: ("THIN_PRISM_FISHEYE", 12),
-}
-PARAMETER_COUNTS = dict(MODELS.values())
-SUPPORTED = (
-    "SIMPLE_PINHOLE",
-    "PINHOLE",
-    "SIMPLE_RADIAL",
-    "RADIAL",
-    "OPENCV",
-    "FULL_OPENCV",
-    "OPENCV_FISHEYE",
-    "SIMPLE_RADIAL_FISHEYE",
-    "RADIAL_FISHEYE",
-)
+# By the number in the binary format; the last shows all around, which no pinhole image can.
+MODEL_NAMES = (*COLMAP_MODELS, "EQUIRECTANGULAR")
+PARAMETER_COUNTS = {name: focals + 2 + count for name, (_, focals, count) in COLMAP_MODELS.items()}
+PARAMETER_COUNTS["EQUIRECTANGULAR"] = 2
+GREY = 128.0
+PLACES = ("sparse", "colmap/sparse", "dense/sparse", "dense/0/sparse", "distorted/sparse", ".")
+RECORD_BYTES = {"cameras": 24, "images": 73, "points3D": 43}  # the least of one record
 
 
 @dataclass(frozen=True)
@@ -55,18 +37,18 @@ class ImageRecord:
     translation: tuple[float, ...]
 
 
-def read_cameras(folder: Path) -> dict[int, Lens]:
-    """Lenses by camera id.
+def read_cameras(folder: Path) -> dict[int, Lens | InputError]:
+    """Lenses by camera id; of a camera that cannot be used, the error that says why.
 
     Raises:
-        InputError: The file is missing or damaged, or a camera model is not supported.
+        InputError: The file is missing or damaged.
     """
     path = _model_file(folder, "cameras")
-    lenses: dict[int, Lens] = {}
+    lenses: dict[int, Lens | InputError] = {}
     for camera_id, model, width, height, values in (
         _cameras_binary(path) if path.suffix == ".bin" else _cameras_text(path)
     ):
-        lenses[camera_id] = _lens(f"{path}: camera {camera_id}", model, width, height, values)
+        lenses[camera_id] = _lens_or_error(f"{path}: camera {camera_id}", model, width, height, values)
     return lenses
 
 
@@ -81,8 +63,8 @@ def read_images(folder: Path) -> list[ImageRecord]:
     return sorted(records, key=lambda record: record.name)
 
 
-def read_points(path: str | Path) -> tuple[NDArray[np.float64], NDArray[np.uint8]]:
-    """The sparse points of a model: positions, float64 [N, 3], and colours, uint8 [N, 3].
+def read_points(path: str | Path) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """The sparse points of a model: positions, float64 [N, 3], and colors as they stand there, float64 [N, 3].
 
     Args:
         path: points3D.bin, points3D.txt, or a folder that holds one (the model, or what `load_views` takes).
@@ -97,15 +79,55 @@ def read_points(path: str | Path) -> tuple[NDArray[np.float64], NDArray[np.uint8
     for row in _points_binary(path) if path.suffix == ".bin" else _points_text(path):
         numbers.extend(row)
     table = np.frombuffer(numbers, dtype=np.float64).reshape(-1, 6) if numbers else np.zeros((0, 6))
-    return np.ascontiguousarray(table[:, :3]), table[:, 3:].astype(np.uint8)
+    return np.ascontiguousarray(table[:, :3]), np.ascontiguousarray(table[:, 3:])
 
 
 def find_model(folder: Path) -> Path | None:
-    """The sparse model of a data set: in sparse/0, sparse, colmap/sparse/0 or the folder itself."""
-    for candidate in (folder / "sparse" / "0", folder / "sparse", folder / "colmap" / "sparse" / "0", folder):
-        if any((candidate / f"cameras{suffix}").is_file() for suffix in (".bin", ".txt")):
-            return candidate
-    return None
+    """The sparse model of a data set, the one with most images where it holds several."""
+    models = find_models(folder)
+    return max(models, key=count_images) if models else None  # the first of equals
+
+
+def find_models(folder: Path) -> list[Path]:
+    """The models in the first place that holds any: sparse/*, sparse, colmap/sparse/*, ..., the folder itself."""
+    for place in (folder / name for name in PLACES):
+        numbered = sorted((path for path in _folders(place) if _holds(path, "cameras")), key=_by_number)
+        # The folder that was asked for counts before what lies in it.
+        models = [place, *numbered] if place == folder else [*numbered, place]
+        models = [path for path in models if _holds(path, "cameras")]
+        if models:
+            return models[:1] if models[0] == folder else models
+    return []
+
+
+def count_images(model: Path) -> int:
+    """How many images a model says it holds, at most what its file has room for; 0 if it has none."""
+    for suffix in (".bin", ".txt"):
+        path = model / f"images{suffix}"
+        if not path.is_file():
+            continue
+        with reading(path), open(path, "rb") as file:
+            if suffix == ".bin":
+                count = int.from_bytes(file.read(8), "little")
+                return min(count, path.stat().st_size // RECORD_BYTES["images"])
+            return sum(1 for line in file if len(line.split()) >= 10 and not line.lstrip().startswith(b"#"))
+    return 0
+
+
+def _folders(place: Path) -> list[Path]:
+    try:
+        return [path for path in place.iterdir() if path.is_dir()]
+    except OSError:
+        return []
+
+
+def _holds(folder: Path, name: str) -> bool:
+    return any((folder / f"{name}{suffix}").is_file() for suffix in (".bin", ".txt"))
+
+
+def _by_number(folder: Path) -> tuple[bool, int, str]:
+    number = folder.name.isdecimal()
+    return not number, int(folder.name) if number else 0, folder.name
 
 
 def _model_file(folder: Path, name: str) -> Path:
@@ -116,20 +138,26 @@ def _model_file(folder: Path, name: str) -> Path:
     raise InputError(f"{folder}: has neither {name}.bin nor {name}.txt; export the sparse model with COLMAP")
 
 
+def _lens_or_error(where: str, model: str, width: int, height: int, values: tuple[float, ...]) -> Lens | InputError:
+    try:
+        return _lens(where, model, width, height, values)
+    except InputError as error:
+        return error
+
+
 def _lens(where: str, model: str, width: int, height: int, values: tuple[float, ...]) -> Lens:
-    if model not in SUPPORTED:
-        raise InputError(
-            f"{where}: model {model} is not supported (supported: {', '.join(SUPPORTED)}); run COLMAP's "
-            "image_undistorter first"
-        )
+    model = model.upper()
+    if model not in COLMAP_MODELS:
+        remedy = "run COLMAP's image_undistorter first"
+        if model == "EQUIRECTANGULAR":
+            remedy = "cut the panoramas into perspective images first (COLMAP's panorama_sfm.py does)"
+        raise InputError(f"{where}: model {model} is not supported (supported: {', '.join(COLMAP_MODELS)}); {remedy}")
     if len(values) != PARAMETER_COUNTS[model]:
         raise InputError(f"{where}: model {model} has {PARAMETER_COUNTS[model]} parameters, found {len(values)}")
-    if model.startswith("SIMPLE_") or model in ("RADIAL", "RADIAL_FISHEYE"):
-        values = (values[0], *values)  # one focal length for both axes
-    fx, fy, cx, cy, *distortion = values
+    kind, focals, _ = COLMAP_MODELS[model]
+    fx, fy, cx, cy, *distortion = values if focals == 2 else (values[0], *values)
     try:
-        # The order of FULL_OPENCV (k1 k2 p1 p2 k3 k4 k5 k6), and so of those that are a part of it, is OpenCV's.
-        return Lens(fx, fy, cx, cy, width, height, tuple(distortion), "FISHEYE" in model)
+        return Lens(fx, fy, cx, cy, width, height, tuple(distortion), kind)
     except InputError as error:
         raise InputError(f"{where}: {error}") from None
 
@@ -178,12 +206,14 @@ def _cameras_binary(path: Path) -> Iterator[tuple[int, str, int, int, tuple[floa
     data = _Bytes(path)
     for _ in data.records("camera"):
         camera_id, number, width, height = data.take("iiQQ")
-        if number not in MODELS:
+        if not 0 <= number < len(MODEL_NAMES):
+            # How many parameters it has is not known, so what follows cannot be read either.
             raise InputError(
-                f"{path}: camera {camera_id}: model number {number} is not known; export the model as text"
+                f"{path}: camera {camera_id}: model number {number} is not known (0 to {len(MODEL_NAMES) - 1} are); "
+                "run COLMAP's image_undistorter, which writes PINHOLE cameras"
             )
-        model, count = MODELS[number]
-        yield camera_id, model, width, height, data.take(f"{count}d")
+        model = MODEL_NAMES[number]
+        yield camera_id, model, width, height, data.take(f"{PARAMETER_COUNTS[model]}d")
 
 
 def _images_binary(path: Path) -> Iterator[ImageRecord]:
@@ -206,7 +236,8 @@ def _points_binary(path: Path) -> Iterator[tuple[float, ...]]:
 
 def _lines(path: Path) -> Iterator[tuple[int, str]]:
     """Numbered lines without comments."""
-    text = io.TextIOWrapper(io.BytesIO(read_bytes(path)), "utf-8", "replace")
+    # Some editors put a mark at the start, which "utf-8-sig" takes off.
+    text = io.TextIOWrapper(io.BytesIO(read_bytes(path)), "utf-8-sig", "replace")
     for number, line in enumerate(text, start=1):
         if not line.lstrip().startswith("#"):
             yield number, line.strip()
@@ -217,24 +248,39 @@ def _cameras_text(path: Path) -> Iterator[tuple[int, str, int, int, tuple[float,
         if line:
             fields = line.split()
             try:
-                camera_id, width, height = int(fields[0]), int(fields[2]), int(fields[3])
+                camera_id, width, height = (_whole(fields[i]) for i in (0, 2, 3))
                 yield camera_id, fields[1], width, height, tuple(map(float, fields[4:]))
-            except (IndexError, ValueError):
+            except (IndexError, ValueError, OverflowError):
                 raise _malformed(path, number, "CAMERA_ID MODEL WIDTH HEIGHT PARAMS[]") from None
 
 
 def _images_text(path: Path) -> Iterator[ImageRecord]:
-    lines = _lines(path)
-    for number, line in lines:
-        if line:
-            fields = line.split(maxsplit=9)
-            try:
-                pose = tuple(map(float, fields[1:8]))
-                record = ImageRecord(int(fields[8]), fields[9], pose[:4], pose[4:])
-            except (IndexError, ValueError):
-                raise _malformed(path, number, "IMAGE_ID QW QX QY QZ TX TY TZ CAMERA_ID NAME") from None
-            yield record
-            next(lines, None)  # the observations, an empty line if there are none
+    """Images, each with or without the line of observations that COLMAP puts below it."""
+    below = False  # whether the line before was an image
+    for number, line in _lines(path):
+        fields = line.split(maxsplit=9)
+        if not fields or (below and _are_observations(line)):
+            below = False
+            continue
+        try:
+            pose = tuple(map(float, fields[1:8]))
+            record = ImageRecord(_whole(fields[8]), fields[9], pose[:4], pose[4:])
+        except (IndexError, ValueError, OverflowError):
+            raise _malformed(path, number, "IMAGE_ID QW QX QY QZ TX TY TZ CAMERA_ID NAME") from None
+        below = True
+        yield record
+
+
+def _are_observations(line: str) -> bool:
+    """Whether a line holds triplets X, Y, POINT3D_ID, and nothing but numbers."""
+    fields = line.split()
+    if len(fields) % 3:
+        return False
+    try:
+        list(map(float, fields))
+    except ValueError:
+        return False
+    return True
 
 
 def _points_text(path: Path) -> Iterator[tuple[float, ...]]:
@@ -243,11 +289,19 @@ def _points_text(path: Path) -> Iterator[tuple[float, ...]]:
             fields = line.split(maxsplit=7)
             try:
                 values = tuple(map(float, fields[1:7]))
-                if len(values) < 6 or not all(0 <= c <= 255 for c in values[3:]):
+                if len(values) not in (3, 6) or not all(0 <= c <= 255 for c in values[3:]):
                     raise ValueError
             except ValueError:
                 raise _malformed(path, number, "POINT3D_ID X Y Z R G B ERROR TRACK[]") from None
-            yield values
+            yield values if len(values) == 6 else (*values, GREY, GREY, GREY)
+
+
+def _whole(text: str) -> int:
+    """A whole number, which some tools write as 1920.0."""
+    value = float(text)
+    if value != int(value):
+        raise ValueError(text)
+    return int(value)
 
 
 def _malformed(path: Path, number: int, expected: str) -> InputError:

@@ -6,6 +6,7 @@ The only module that imports plyfile (GPLv3).
 from __future__ import annotations
 
 import logging
+import math
 import os
 import re
 from collections.abc import Mapping, Sequence
@@ -18,6 +19,8 @@ from numpy.typing import NDArray
 from sgwarp.errors import InputError
 from sgwarp.files.access import reading
 from sgwarp.files.atomic import atomic_path
+from sgwarp.io.colors import rgb_names, unit_colors
+from sgwarp.io.formats.foreign import describe_ply
 from sgwarp.io.ply_header import check_ply
 from sgwarp.scene import SH_COUNTS, Gaussians
 
@@ -28,6 +31,8 @@ NORMAL = ("nx", "ny", "nz")
 COLOUR = ("f_dc_0", "f_dc_1", "f_dc_2")
 SCALE = ("scale_0", "scale_1", "scale_2")
 ROTATION = ("rot_0", "rot_1", "rot_2", "rot_3")
+FILTER = "filter_3D"  # of Mip-Splatting, a standard deviation
+SH_C0 = 0.28209479177387814  # constant of degree 0: color = SH_C0 f_dc + 0.5
 REST_COUNTS = tuple(3 * (k - 1) for k in SH_COUNTS)  # 0, 9, 24, 45
 
 # Below the logarithm of the smallest float32 (1.4e-45, -103.3): exp() and sigmoid() of it are exactly 0 again.
@@ -90,39 +95,88 @@ def gaussians_from_elements(path: str | os.PathLike[str], elements: Elements) ->
     if vertex is None:
         raise InputError(f"{path}: has no element 'vertex' (it has: {', '.join(elements) or 'none'}); not a 3DGS scene")
     names = vertex.dtype.names or ()
-    needed = (*POSITION, *COLOUR, "opacity", *SCALE, *ROTATION)
-    missing = [name for name in needed if name not in names]
-    if set(missing) >= {*COLOUR, "opacity", *SCALE, *ROTATION}:
-        raise InputError(f"{path}: is a point cloud or mesh, not a 3DGS scene: no columns {', '.join(missing)}")
+    if foreign := describe_ply(names, elements):
+        raise InputError(f"{path}: {foreign}")
+    rgb = None if set(COLOUR) <= set(names) else rgb_names(names)
+    flat = "scale_2" not in names and {"scale_0", "scale_1"} <= set(names)
+    shape = SCALE[:2] if flat else SCALE
+    needed = (*POSITION, "opacity", *shape, *ROTATION)
+    missing = [name for name in (*needed, *(rgb or COLOUR)) if name not in names]
     if missing:
         raise InputError(f"{path}: lacks the columns {', '.join(missing)} of a 3DGS scene")
+    if len(vertex) == 0:
+        raise InputError(f"{path}: has no Gaussians (element 'vertex' has 0 rows)")
+    log = logging.getLogger("sgwarp")
+    values = columns(path, vertex, needed)
+    means, logits, log_scales, quats = np.split(values, np.cumsum([3, 1, len(shape)]), axis=1)
+    with np.errstate(over="ignore", invalid="ignore"):
+        opacities = (1.0 / (1.0 + np.exp(-logits[:, 0].astype(np.float64)))).astype(np.float32)
+        scales = np.exp(log_scales.astype(np.float64)).astype(np.float32)
+    if flat:
+        log.warning("%s: has two scales a Gaussian (2DGS); read as flat Gaussians", path)
+        scales = np.concatenate([scales, np.zeros((len(scales), 1), np.float32)], axis=1)
+    if FILTER in names:
+        log.warning("%s: the 3D filter of Mip-Splatting (%s) is applied to scales and opacities", path, FILTER)
+        scales, opacities = _filtered(scales, opacities, columns(path, vertex, (FILTER,)))
+    sh = _plain_colors(path, vertex, rgb) if rgb is not None else _harmonics(path, vertex)
+    rest = {name for name in names if re.fullmatch(r"f_rest_\d+", name)}
+    own = {*needed, *(rgb or COLOUR), *NORMAL, *rest, FILTER}
+    extras = {name: np.array(vertex[name]) for name in names if name not in own and not vertex.dtype[name].hasobject}
+    if extras:
+        log.info("%s: columns kept as they are: %s", path, ", ".join(extras))
+    if lists := [name for name in names if vertex.dtype[name].hasobject]:
+        log.warning("%s: columns left out: %s", path, ", ".join(lists))
+    return build_gaussians(path, means, quats, scales, opacities, sh, extras=extras or None)
+
+
+def _harmonics(path: str | os.PathLike[str], vertex: NDArray[Any]) -> NDArray[np.float32]:
+    """Coefficients of f_dc_* and f_rest_*, float32 [N, K, 3]; degree 4 and up are left out."""
+    names = vertex.dtype.names or ()
     rest = sum(re.fullmatch(r"f_rest_\d+", name) is not None for name in names)
-    rest_names = tuple(f"f_rest_{i}" for i in range(rest))
-    if rest not in REST_COUNTS or not set(rest_names) <= set(names):
+    per_channel = rest // 3
+    degree = math.isqrt(per_channel + 1) - 1
+    whole = rest % 3 == 0 and (degree + 1) ** 2 == per_channel + 1
+    if not whole or not {f"f_rest_{i}" for i in range(rest)} <= set(names):
         raise InputError(
             f"{path}: has {rest} columns f_rest_*, expected none, or f_rest_0 up to f_rest_8, 23 or 44 (degree 1 to 3)"
         )
-    if len(vertex) == 0:
-        raise InputError(f"{path}: has no Gaussians (element 'vertex' has 0 rows)")
-    extra = [name for name in names if name not in {*needed, *rest_names, *NORMAL}]
-    if extra:
-        logging.getLogger("sgwarp").warning("%s: columns left out: %s", path, ", ".join(extra))
-    values = columns(path, vertex, (*needed, *rest_names))
-    means, dc, logits, log_scales, quats, sh_rest = np.split(values, np.cumsum([3, 3, 1, 3, 4]), axis=1)
+    kept = min(per_channel, SH_COUNTS[-1] - 1)
+    if kept < per_channel:
+        logging.getLogger("sgwarp").warning("%s: harmonics of degree %d; up to 3 are kept", path, degree)
     # The file holds all coefficients of red, then all of green, then all of blue.
-    sh = np.concatenate([dc[:, None, :], sh_rest.reshape(len(values), 3, rest // 3).transpose(0, 2, 1)], axis=1)
-    with np.errstate(over="ignore", invalid="ignore"):
-        opacities = 1.0 / (1.0 + np.exp(-logits[:, 0].astype(np.float64)))
-        scales = np.exp(log_scales.astype(np.float64)).astype(np.float32)
-    return build_gaussians(path, means, quats, scales, opacities.astype(np.float32), sh)
+    chosen = [f"f_rest_{channel * per_channel + i}" for channel in range(3) for i in range(kept)]
+    values = columns(path, vertex, (*COLOUR, *chosen))
+    higher = values[:, 3:].reshape(len(values), 3, kept).transpose(0, 2, 1)
+    return np.concatenate([values[:, None, :3], higher], axis=1)
+
+
+def _plain_colors(path: str | os.PathLike[str], vertex: NDArray[Any], names: Sequence[str]) -> NDArray[np.float32]:
+    """Coefficients of degree 0 from columns of colors, float32 [N, 1, 3]."""
+    kinds = {vertex.dtype[name] for name in names}
+    values = columns(path, vertex, names, np.float64)
+    colors = unit_colors(values.astype(kinds.pop()) if len(kinds) == 1 else values)
+    return ((colors - np.float32(0.5)) / np.float32(SH_C0))[:, None]
+
+
+def _filtered(
+    scales: NDArray[np.float32], opacities: NDArray[np.float32], width: NDArray[np.float32]
+) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+    """Scales and opacities after a Gaussian of standard deviation `width` [N, 1] (Yu et al. 2024, equation 7)."""
+    before = scales.astype(np.float64) ** 2
+    after = before + width.astype(np.float64) ** 2
+    with np.errstate(invalid="ignore", divide="ignore"):
+        share = np.sqrt(np.prod(np.where(after > 0, before / after, 1.0), axis=1))
+    return np.sqrt(after).astype(np.float32), (opacities * share).astype(np.float32)
 
 
 def read_ply(path: str | os.PathLike[str]) -> Gaussians:
     """Read a 3DGS scene, ascii or binary, columns in any order and of any scalar type.
 
     Columns x y z, f_dc_0..2, opacity (logit), scale_0..2 (logarithm), rot_0..3 (w, x, y, z) are required; the number
-    of f_rest_* columns (0, 9, 24, 45) gives the SH degree. Normals are ignored; other columns are left out with a
-    logged notice. Rows with NaN or infinity are kept, with a logged notice of how many there are.
+    of f_rest_* columns (0, 9, 24, 45) gives the SH degree. Plain colors (red, green, blue) may stand for f_dc_*.
+    Without scale_2 (2DGS) the Gaussians are flat: their third scale is 0. The 3D filter of Mip-Splatting is applied.
+    Normals are ignored; other columns are kept (`Gaussians.extras`). Rows with NaN or infinity are kept, with a logged
+    notice of how many there are.
 
     Raises:
         InputError: The file is missing, cut short, no 3DGS scene, or empty.
@@ -133,8 +187,9 @@ def read_ply(path: str | os.PathLike[str]) -> Gaussians:
 def write_ply(gaussians: Gaussians, path: str | os.PathLike[str]) -> None:
     """Write a scene with the columns of the reference implementation, binary little-endian float32.
 
-    Opacities 0 and 1 become logits -110 and 110 and a scale of 0 the logarithm -110, which read back exactly; all
-    other values read back to a relative 1e-6.
+    Columns that the scene was read with and that are none of them are written back, in their own types.
+    Opacities 0 and 1 become logits -110 and 110 and a scale of 0 the logarithm -110, which read back exactly; all other
+    values read back to a relative 1e-6.
 
     Raises:
         InputError: The scene is empty or the file cannot be written.
@@ -152,15 +207,31 @@ def write_ply(gaussians: Gaussians, path: str | os.PathLike[str]) -> None:
     parts = (means, np.zeros_like(means), sh[:, 0], sh_rest, logits, log_scales, quats)
     table = np.concatenate([part.astype("<f4") for part in parts], axis=1)
     rows = table.view([(name, "<f4") for name in names]).reshape(-1)
-    write_elements(path, {"vertex": rows})
+    write_elements(path, {"vertex": _with_extras(rows, gaussians.extras)})
 
 
-def columns(path: str | os.PathLike[str], rows: NDArray[Any], names: Sequence[str]) -> NDArray[np.float32]:
-    """Gather the named columns as float32 [N, len(names)]; a list column is an InputError."""
+def _with_extras(rows: NDArray[Any], extras: Mapping[str, NDArray[Any]] | None) -> NDArray[Any]:
+    """The rows with further columns behind."""
+    further = {name: column for name, column in (extras or {}).items() if name not in (rows.dtype.names or ())}
+    if not further:
+        return rows
+    described = rows.dtype.descr + [(name, column.dtype.newbyteorder("<").str) for name, column in further.items()]
+    wide = np.empty(len(rows), described)
+    for name in rows.dtype.names or ():
+        wide[name] = rows[name]
+    for name, column in further.items():
+        wide[name] = column
+    return wide
+
+
+def columns(
+    path: str | os.PathLike[str], rows: NDArray[Any], names: Sequence[str], kind: Any = np.float32
+) -> NDArray[Any]:
+    """Gather the named columns as float32 (or another `kind`) [N, len(names)]; a list column is an InputError."""
     lists = [name for name in names if rows.dtype[name].hasobject]
     if lists:
         raise InputError(f"{path}: column {lists[0]} holds lists, expected one number per row")
-    values = np.empty((len(rows), len(names)), dtype=np.float32)
+    values = np.empty((len(rows), len(names)), dtype=kind)
     # A double beyond float32 becomes infinity, a signalling NaN a quiet one: both are counted as non-finite.
     with np.errstate(over="ignore", invalid="ignore"):
         for start in range(0, len(rows), ROWS_PER_BLOCK):
@@ -170,9 +241,14 @@ def columns(path: str | os.PathLike[str], rows: NDArray[Any], names: Sequence[st
     return values
 
 
-def build_gaussians(path: str | os.PathLike[str], *fields: NDArray[np.float32]) -> Gaussians:
+def build_gaussians(
+    path: str | os.PathLike[str], *fields: NDArray[Any], extras: Mapping[str, NDArray[Any]] | None = None
+) -> Gaussians:
     """Gaussians from arrays in the order of its fields; says how many rows are not finite."""
-    gaussians = Gaussians(*(torch.from_numpy(np.ascontiguousarray(field)) for field in fields))
+    means, quats, scales, opacities, sh = (
+        torch.from_numpy(np.ascontiguousarray(field, np.float32)) for field in fields
+    )
+    gaussians = Gaussians(means, quats, scales, opacities, sh, extras)
     if gaussians.non_finite:
         logging.getLogger("sgwarp").warning(
             "%s: %d of %d Gaussians hold NaN or infinity; they are kept, and never rendered",

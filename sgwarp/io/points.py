@@ -13,14 +13,15 @@ from numpy.typing import NDArray
 from sgwarp.errors import InputError
 from sgwarp.files.documents import read_json
 from sgwarp.io.colmap_model import find_model, read_points
+from sgwarp.io.colors import rgb_names, unit_colors
 from sgwarp.io.names import inside
-from sgwarp.io.ply import POSITION, columns, read_elements
+from sgwarp.io.ply import COLOUR, POSITION, columns, read_elements
 from sgwarp.io.world import apply_transform, camera_places, far_origin, transform_of_points
 
 PLY_NAMES = ("points3D.ply", "sparse_pc.ply", "point_cloud.ply")  # beside a transforms.json that names none
 PLY_KEY = "ply_file_path"  # of nerfstudio's transforms.json
-RGB = ("red", "green", "blue")
 GREY = 0.5
+SH_C0 = 0.28209479177387814  # constant of degree 0: color = SH_C0 f_dc + 0.5
 
 Points = tuple[NDArray[np.float64], NDArray[np.float32]]  # positions [N, 3] [m], colours [N, 3] in [0, 1]
 
@@ -52,11 +53,15 @@ def load_points(path: str | os.PathLike[str], views: str | os.PathLike[str] | No
     if source.suffix.lower() == ".ply":
         positions, colours = _read_ply(source)
     else:
-        positions, bytes_ = read_points(source)
-        colours = bytes_.astype(np.float32) / np.float32(255)
+        positions, stored = read_points(source)
+        colours = unit_colors(stored if source.suffix == ".txt" else stored.astype(np.uint8))
     finite = np.isfinite(positions).all(axis=1) & np.isfinite(colours).all(axis=1)
     if not finite.any():
         raise InputError(f"{source}: holds no finite points; export them again, or start without any")
+    if not finite.all():
+        logging.getLogger("sgwarp").warning(
+            "%s: left out %d of %d points: not finite", source, int((~finite).sum()), len(positions)
+        )
     return _placed(source, Path(views if views is not None else path), positions[finite]), colours[finite].clip(0, 1)
 
 
@@ -116,8 +121,14 @@ def _read_ply(path: Path) -> Points:
     vertex = elements.get("vertex")
     if vertex is None or not set(POSITION) <= set(vertex.dtype.names or ()):
         raise InputError(f"{path}: has no element 'vertex' with x, y, z; expected points")
-    positions = columns(path, vertex, POSITION).astype(np.float64)
-    if not set(RGB) <= set(vertex.dtype.names or ()):
-        return positions, np.full(positions.shape, GREY, np.float32)
-    colours = columns(path, vertex, RGB)
-    return positions, colours / np.float32(255) if vertex.dtype["red"].kind in "iu" else colours
+    # In the file's own precision: coordinates of a country do not fit float32.
+    positions = columns(path, vertex, POSITION, np.float64)
+    names = vertex.dtype.names or ()
+    if (rgb := rgb_names(names)) is not None:
+        kinds = {vertex.dtype[name] for name in rgb}
+        values = columns(path, vertex, rgb, np.float64)
+        return positions, unit_colors(values.astype(kinds.pop()) if len(kinds) == 1 else values)
+    if set(COLOUR) <= set(names):  # a 3DGS scene
+        return positions, (columns(path, vertex, COLOUR) * np.float32(SH_C0) + np.float32(0.5)).clip(0, 1)
+    logging.getLogger("sgwarp").warning("%s: its points have no colors; they start grey", path)
+    return positions, np.full(positions.shape, GREY, np.float32)

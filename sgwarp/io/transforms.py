@@ -14,16 +14,30 @@ from numpy.typing import NDArray
 
 from sgwarp.errors import InputError
 from sgwarp.files.documents import read_json
+from sgwarp.files.exif import UPRIGHT
 from sgwarp.files.images import read_size
+from sgwarp.io.lens_models import COLMAP_MODELS, LensModel
 from sgwarp.io.names import inside
+from sgwarp.io.photographs import LeftOut, fit_photograph, say_orientations
 from sgwarp.io.stems import IMAGE_SUFFIXES, unique_stems
-from sgwarp.io.undistort import Lens, pinhole_view
+from sgwarp.io.undistort import Lens, Listed, pinhole_view
 from sgwarp.scene import View
 
-PERSPECTIVE_MODELS = ("SIMPLE_PINHOLE", "PINHOLE", "SIMPLE_RADIAL", "RADIAL", "OPENCV")
-FISHEYE_MODELS = ("OPENCV_FISHEYE",)
-PERSPECTIVE_DISTORTION = ("k1", "k2", "p1", "p2", "k3")
-FISHEYE_DISTORTION = ("k1", "k2", "k3", "k4")
+# Names of the coefficients, by model, in the order of sgwarp.io.lens_models.
+COEFFICIENTS: dict[LensModel, tuple[str, ...]] = {
+    "perspective": ("k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6"),
+    "fisheye": ("k1", "k2", "k3", "k4"),
+    "fov": ("omega",),
+    "thin_prism_fisheye": ("k1", "k2", "p1", "p2", "k3", "k4", "sx1", "sy1"),
+    "rad_tan_thin_prism_fisheye": tuple(["k0", "k1", "k2", "k3", "k4", "k5", "p0", "p1", "s0", "s1", "s2", "s3"]),
+    "division": ("k",),
+    "eucm": ("alpha", "beta"),
+}
+RATIONAL = ("k4", "k5", "k6")  # of FULL_OPENCV alone
+MISSING, UNPOSED = "without photograph", "whose pose holds NaN or infinity"
+DEPTH_UNIT, MILLIMETER = "depth_unit_scale_factor", 1e-3
+BELONGINGS = ("mask_path", "depth_file_path")
+IGNORED = ("train_filenames", "val_filenames", "test_filenames", "semantics_path", "normal_file_path", "exposure")
 OPENGL_TO_OPENCV = np.diag([1.0, -1.0, -1.0, 1.0])  # camera y up, z back -> y down, z forward
 RIGID_TOLERANCE = 1e-3
 MAX_NUMBER = 1e100  # JSON knows integers that no float can hold
@@ -36,23 +50,21 @@ def read_transforms(path: str | os.PathLike[str], photographs: bool = True) -> l
 
     Intrinsics (fl_x fl_y cx cy w h, or camera_angle_x/y; k1 k2 k3 k4 p1 p2) may stand in a frame or once for all; a
     frame's own win. A missing fl_y equals fl_x, a missing principal point is the centre of the image, a missing size
-    is that of the first photograph. The extension of a file name may be missing. Frames whose photograph does not
-    exist and frames whose pose holds NaN or infinity are left out, with a logged notice of how many. Distorted
-    photographs are undistorted when read (`View.undistort`), and the camera is that of the undistorted image.
+    is that of the photograph. The extension of a file name may be missing. Frames that cannot be used (no photograph,
+    one of another shape, no rigid pose) are left out, with a logged notice of how many. Distorted photographs are
+    undistorted when read (`View.undistort`), and the camera is that of the undistorted image.
 
     Args:
         path: The JSON file; file names in it are relative to its folder.
         photographs: False to take the cameras alone: then no photograph is looked for, and sizes must be in the file.
 
     Raises:
-        InputError: The file is missing or malformed, a camera model is not supported, a pose is not rigid, or no
-            frame is left.
+        InputError: The file is missing or malformed, or no frame is left.
     """
     path = Path(path)
     meta = _parse(path)
+    left_out = LeftOut(path, "frames")
     kept: list[tuple[int, Fields, NDArray[np.float64], Path | None]] = []
-    missing: list[str] = []
-    unposed = 0
     for index, frame in enumerate(meta["frames"]):
         where = f"{path}: frame {index}"
         name = frame.get("file_path") if isinstance(frame, dict) else None
@@ -60,32 +72,89 @@ def read_transforms(path: str | os.PathLike[str], photographs: bool = True) -> l
             raise InputError(f"{where}: has no 'file_path'; name the photograph it belongs to")
         image = _find_image(path, name) if photographs else None
         if photographs and image is None:
-            missing.append(name)
+            left_out.add(MISSING, name)
             continue
-        pose = _world_to_camera(f"{where} ({name})", frame.get("transform_matrix"))
+        try:
+            pose = _world_to_camera(f"{where} ({name})", frame.get("transform_matrix"))
+        except InputError as error:
+            left_out.fail(error, name)
+            continue
         if pose is None:
-            unposed += 1
-            continue
-        kept.append((index, frame, pose, image))
-    log = logging.getLogger("sgwarp")
-    if missing:
-        log.warning("%s: left out %d frames without photograph, first %r", path, len(missing), missing[0])
-    if unposed:
-        log.warning("%s: left out %d frames whose pose holds NaN or infinity", path, unposed)
-    if not kept:
-        raise InputError(
-            f"{path}: none of {len(meta['frames'])} frames can be used: {len(missing)} photographs do not exist (first "
-            f"{path.parent / missing[0] if missing else '-'}), {unposed} poses hold NaN or infinity"
-        )
+            left_out.add(UNPOSED, name)
+        else:
+            kept.append((index, frame, pose, image))
     stems = unique_stems(path, [frame["file_path"] for _, frame, _, _ in kept])
-    size: tuple[int, int] | None = None
-    views = []
+    views, used = [], []
     for stem, (index, frame, pose, image) in zip(stems, kept, strict=True):
-        where = f"{path}: frame {index} ({frame['file_path']})"
-        if size is None and image is not None and not all(key in frame or key in meta for key in ("w", "h")):
-            size = read_size(image)
-        views.append(pinhole_view(where, stem, _lens(where, frame, meta, size), pose, image))
+        try:
+            view, orientation = _view(path, meta, stem, index, frame, pose, image)
+        except InputError as error:
+            left_out.fail(error, frame["file_path"])
+            continue
+        views.append(view)
+        if image is not None:
+            used.append((image, orientation))
+    if not views:
+        first = left_out.first(MISSING)
+        raise InputError(
+            left_out.first_error
+            or f"{path}: none of {len(meta['frames'])} frames can be used: {left_out.count(MISSING)} photographs do "
+            f"not exist (first {path.parent / first if first else '-'}), {left_out.count(UNPOSED)} poses hold NaN or "
+            "infinity"
+        )
+    left_out.say()
+    say_orientations(path, used)
+    _say_ignored(path, meta)
     return views
+
+
+def _view(
+    path: Path, meta: Fields, stem: str, index: int, frame: Fields, pose: NDArray[np.float64], image: Path | None
+) -> tuple[View, int]:
+    """The view of a frame, and the EXIF orientation that its photograph has to be turned by."""
+    name = frame["file_path"]
+    where = f"{path}: frame {index} ({name})"
+    sized = all(key in frame or key in meta for key in ("w", "h"))
+    lens, orientation = (
+        _lens(where, frame, meta, read_size(image) if image is not None and not sized else None),
+        UPRIGHT,
+    )
+    if image is not None and sized:
+        lens, orientation = fit_photograph(lens, image)
+    mask, depth = (_belonging(path, frame, key) for key in BELONGINGS)
+    unit = frame.get(DEPTH_UNIT, meta.get(DEPTH_UNIT, MILLIMETER))
+    if isinstance(unit, bool) or not isinstance(unit, (int, float)) or not 0 < unit < MAX_NUMBER:
+        raise InputError(f"{where}: '{DEPTH_UNIT}' must be a positive number of meters, got {unit!r}")
+    listed = Listed(name, image, orientation, mask, depth, float(unit))
+    return pinhole_view(where, stem, lens, pose, listed), orientation
+
+
+def _belonging(path: Path, frame: Fields, key: str) -> Path | None:
+    """A file that a frame names beside its photograph, or None; `_say_ignored` tells of those that do not exist."""
+    name = frame.get(key)
+    if not isinstance(name, str) or not name:
+        return None
+    try:
+        file = inside(path, path.parent, name)
+    except InputError:  # outside the data set: as if it were not there
+        return None
+    return file if os.path.isfile(file) else None
+
+
+def _say_ignored(path: Path, meta: Fields) -> None:
+    """Log what the file declares and nothing here reads, and files that it names and that do not exist."""
+    for key in BELONGINGS:
+        named = [frame[key] for frame in meta["frames"] if frame.get(key)]
+        absent = [frame[key] for frame in meta["frames"] if frame.get(key) and _belonging(path, frame, key) is None]
+        if absent:
+            logging.getLogger("sgwarp").warning(
+                "%s: %d of %d files that its frames name as %s do not exist, first %s",
+                *(path, len(absent), len(named), key, absent[0]),
+            )
+    ignored = [key for key in IGNORED if meta.get(key)]
+    ignored += [f"{key} of the frames" for key in IGNORED if any(frame.get(key) for frame in meta["frames"])]
+    if ignored:
+        logging.getLogger("sgwarp").warning("%s: not used: %s", path, ", ".join(dict.fromkeys(ignored)))
 
 
 def _parse(path: Path) -> dict[str, Any]:
@@ -163,16 +232,20 @@ def _lens(where: str, frame: Fields, meta: Fields, size: tuple[int, int] | None)
         return 0.5 * extent / math.tan(0.5 * value)
 
     model = frame.get("camera_model", meta.get("camera_model", "OPENCV"))
-    if model not in (*PERSPECTIVE_MODELS, *FISHEYE_MODELS):
-        supported = ", ".join((*PERSPECTIVE_MODELS, *FISHEYE_MODELS))
+    if not isinstance(model, str) or model not in COLMAP_MODELS:
+        supported = ", ".join(COLMAP_MODELS)
         raise InputError(
             f"{where}: camera_model {model!r} is not supported (supported: {supported}); undistort it first"
         )
-    fisheye = model in FISHEYE_MODELS or bool(frame.get("is_fisheye", meta.get("is_fisheye", False)))
-    keys = FISHEYE_DISTORTION if fisheye else PERSPECTIVE_DISTORTION
-    distortion = tuple(found[1] if (found := number(key)) else 0.0 for key in keys)
-    if not fisheye and (k4 := number("k4")) and k4[1] != 0:
-        raise InputError(f"{where}: 'k4' is only defined for camera_model OPENCV_FISHEYE; correct the camera model")
+    kind: LensModel = COLMAP_MODELS[model][0]
+    if kind == "perspective" and frame.get("is_fisheye", meta.get("is_fisheye", False)):
+        kind = "fisheye"
+    distortion = tuple(found[1] if (found := number(key)) else 0.0 for key in COEFFICIENTS[kind])
+    if kind == "perspective" and model != "FULL_OPENCV":
+        for key in RATIONAL:
+            if (found := number(key)) and found[1] != 0:
+                raise InputError(f"{where}: '{key}' is not defined for camera_model {model}; correct the camera model")
+        distortion = distortion[: -len(RATIONAL)]
     height, width = (pixels(key, size[i] if size else None) for i, key in enumerate(("h", "w")))
     horizontal = number("fl_x", "camera_angle_x") or number("fl_y", "camera_angle_y")
     if horizontal is None:
@@ -182,6 +255,6 @@ def _lens(where: str, frame: Fields, meta: Fields, size: tuple[int, int] | None)
     fy = focal(vertical, height) if vertical else fx
     cx, cy = number("cx"), number("cy")
     try:
-        return Lens(fx, fy, cx[1] if cx else width / 2, cy[1] if cy else height / 2, width, height, distortion, fisheye)
+        return Lens(fx, fy, cx[1] if cx else width / 2, cy[1] if cy else height / 2, width, height, distortion, kind)
     except InputError as error:
         raise InputError(f"{where}: {error}") from None

@@ -8,5 +8,6 @@ from sgwarp.scene.camera import Camera as Camera
 from sgwarp.scene.features import FeatureMap as FeatureMap
 from sgwarp.scene.gaussians import SH_COUNTS as SH_COUNTS
 from sgwarp.scene.gaussians import Gaussians as Gaussians
+from sgwarp.scene.gaussians import join_gaussians as join_gaussians
 from sgwarp.scene.semantics import Semantics as Semantics
 from sgwarp.scene.view import View as View

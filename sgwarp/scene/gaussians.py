@@ -4,15 +4,18 @@ from __future__ import annotations
 
 import hashlib
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
+import numpy as np
 import torch
+from numpy.typing import NDArray
 from torch import Tensor
 
 from sgwarp.scene.checks import float32, require, require_rows, version_of
 
+FIELDS = ("means", "quats", "scales", "opacities", "sh")
 SH_COUNTS = (1, 4, 9, 16)  # coefficients per color channel for degree 0 to 3
 
 
@@ -26,6 +29,8 @@ class Gaussians:
         scales: Standard deviations along the local axes [m], not logarithms, float32 [N, 3].
         opacities: In [0, 1], not logits, float32 [N].
         sh: Spherical-harmonic colour coefficients, float32 [N, K, 3], K in 1, 4, 9, 16 (degree 0 to 3).
+        extras: Other columns of the file by name, such as labels, [N] each, on the host; kept and written back. None
+            if there are none.
 
     Rows with NaN or infinity are kept, so that indices stay those of the file; the renderer leaves them out and counts
     them (`non_finite`).
@@ -39,6 +44,7 @@ class Gaussians:
     scales: Tensor
     opacities: Tensor
     sh: Tensor
+    extras: Any = None  # Mapping[str, NDArray] or None
 
     def __post_init__(self) -> None:
         put = object.__setattr__
@@ -57,6 +63,8 @@ class Gaussians:
         require_rows("scales", self.scales < 0, "a scale is a standard deviation and cannot be negative", self.scales)
         outside = (self.opacities < 0) | (self.opacities > 1)
         require_rows("opacities", outside, "expected a value in [0, 1]; apply the sigmoid to logits", self.opacities)
+        for name, column in (self.extras or {}).items():
+            require(column.shape == (n,), f"extras: column {name} has shape {list(column.shape)}, expected [{n}]")
 
     @classmethod
     def unchecked(cls, means: Tensor, quats: Tensor, scales: Tensor, opacities: Tensor, sh: Tensor) -> Gaussians:
@@ -139,12 +147,25 @@ class Gaussians:
     def to(self, device: str | torch.device) -> Gaussians:
         if torch.device(device) == self.device:
             return self
-        return self._map(lambda t: t.to(device))
+        return self._map(lambda t: t.to(device), self.extras)
 
     def subset(self, index: Tensor) -> Gaussians:
         """The Gaussians at `index` (integers or a boolean mask)."""
-        return self._map(lambda t: t[index])
+        if self.extras is None:
+            return self._map(lambda t: t[index], None)
+        rows = torch.as_tensor(index).cpu().numpy()
+        return self._map(lambda t: t[index], {name: column[rows] for name, column in self.extras.items()})
 
-    def _map(self, change: Callable[[Tensor], Tensor]) -> Gaussians:
-        names = ("means", "quats", "scales", "opacities", "sh")
-        return Gaussians(**{name: change(getattr(self, name)) for name in names})
+    def _map(self, change: Callable[[Tensor], Tensor], extras: Mapping[str, NDArray[Any]] | None) -> Gaussians:
+        means, quats, scales, opacities, sh = (change(getattr(self, name)) for name in FIELDS)
+        return Gaussians(means, quats, scales, opacities, sh, extras)
+
+
+def join_gaussians(parts: Sequence[Gaussians]) -> Gaussians:
+    """Several scenes as one, in this order; the highest degree of harmonics is kept, and the columns all have."""
+    count = max(part.sh.shape[1] for part in parts)
+    padded = [torch.nn.functional.pad(part.sh, (0, 0, 0, count - part.sh.shape[1])) for part in parts]
+    means, quats, scales, opacities = (torch.cat([getattr(part, name) for part in parts]) for name in FIELDS[:-1])
+    names = set.intersection(*(set(part.extras or {}) for part in parts))
+    extras = {name: np.concatenate([(part.extras or {})[name] for part in parts]) for name in sorted(names)}
+    return Gaussians(means, quats, scales, opacities, torch.cat(padded), extras or None)

@@ -24,12 +24,36 @@ class View:
         camera: The (undistorted) pinhole camera.
         image_path: The photograph, or None: then it is rendered from the scene where one is needed.
         undistort: Maps the photograph as stored, uint8 [H, W, 3], to the pinhole image; None if there is nothing to do.
+            With a method `carry(array, nearest)` it does the same to what belongs to the photograph.
+        name: The photograph as its data set lists it, with folders and ending; files are matched by it, too.
+        mask_path: A mask of the photograph that the data set names, or None.
+        depth_path: Depth of the photograph that the data set names, or None.
+        depth_unit: What one step of that depth is, if its file holds whole numbers [m].
     """
 
     stem: str
     camera: Camera
     image_path: Path | None = None
     undistort: Callable[[Any], Any] | None = field(default=None, repr=False)
+    name: str = ""
+    mask_path: Path | None = None
+    depth_path: Path | None = None
+    depth_unit: float = 1e-3
+
+    def carry(self, array: Any, nearest: bool = True) -> Any:
+        """What belongs to the photograph as stored, [h, w] or [h, w, C], as it belongs to the pinhole image.
+
+        It is turned and undistorted like the photograph, and keeps its resolution, which need not be the photograph's.
+
+        Args:
+            array: Ids, masks, depth or features of the photograph.
+            nearest: Mix no values; else interpolate.
+
+        Raises:
+            InputError: It does not have the shape of the photograph.
+        """
+        carry = getattr(self.undistort, "carry", None)
+        return array if carry is None else carry(array, nearest)
 
     def image(self) -> Tensor:
         """Read the photograph, float32 [H, W, 3] in [0, 1].

@@ -6,7 +6,7 @@ from dataclasses import replace
 import pytest
 import torch
 
-from sgwarp.compat.inria import GaussianRasterizationSettings, GaussianRasterizer, dist2
+from sgwarp.compat.inria import GaussianRasterizationSettings, GaussianRasterizer, SparseGaussianAdam, dist2
 from sgwarp.errors import InputError
 from sgwarp.ops.reference import rasterizer as reference
 
@@ -58,6 +58,11 @@ def oracle(raw, settings, principal=(WIDTH / 2, HEIGHT / 2), scale=1.0, antialia
 
 
 def call(raw, settings, leaves=None, means2D=None, **values):
+    """Image and radii; settings that say whether to antialias bring a third value."""
+    return call_today(raw, settings, leaves, means2D, **values)[:2]
+
+
+def call_today(raw, settings, leaves=None, means2D=None, **values):
     means, quats, scales, opacities = raw.shape if leaves is None else leaves
     means2D = torch.zeros_like(means) if means2D is None else means2D
     return GaussianRasterizer(settings)(
@@ -68,7 +73,7 @@ def call(raw, settings, leaves=None, means2D=None, **values):
 def test_image_and_radii(raw):
     settings = settings_of(raw)
     raw.means[:3, 2] = torch.tensor([-3.0, math.nan, 0.0])
-    result = call(raw, settings, shs=raw.sh)
+    result = call_today(raw, settings, shs=raw.sh)
     assert isinstance(result, tuple)
     image, radii = result
     expected, projection, _ = oracle(raw, settings)
@@ -262,3 +267,55 @@ def test_dist2_names_what_is_wrong():
     points[6, 1] = math.nan
     with pytest.raises(InputError, match=r"points\[6\]"):
         dist2(points)
+
+
+@pytest.mark.parametrize("antialiasing", [False, True])
+def test_inverse_depth_is_the_third_value(raw, antialiasing):
+    """The sum of alpha T / z, with gradients, as Inria's rasterizer returns it since October 2024."""
+    settings = settings_of(raw, antialiasing=antialiasing)
+    means, quats, scales, opacities = (t.clone().requires_grad_() for t in raw.shape)
+    image, _, depth = call_today(raw, settings, (means, quats, scales, opacities), shs=raw.sh)
+    expected, projection, leaves = oracle(raw, settings, antialiased=antialiasing)
+    view = settings.viewmatrix.double().T
+    inverse = 1.0 / (leaves[0] @ view[2, :3] + view[2, 3])[:, None]
+    options = reference.ReferenceSettings(alpha_max=0.99, antialiased=antialiasing)
+    wanted = reference.composite(projection, inverse, WIDTH, HEIGHT, None, options)
+    clear = wanted.margin > 1e-4
+    assert depth.shape == (1, HEIGHT, WIDTH)
+    torch.testing.assert_close(depth[0].double()[clear], wanted.features[..., 0][clear], rtol=0, atol=2e-5)
+    torch.testing.assert_close(image.permute(1, 2, 0).double()[clear], expected.features[clear], rtol=0, atol=2e-5)
+    (depth[0] * clear).sum().backward()
+    (wanted.features[..., 0] * clear).sum().backward()
+    torch.testing.assert_close(means.grad.double(), leaves[0].grad, rtol=2e-3, atol=2e-4)
+
+
+def test_harmonics_in_two_parts(raw):
+    settings = settings_of(raw, antialiasing=False)
+    whole = call_today(raw, settings, shs=raw.sh)
+    parts = call_today(raw, settings, dc=raw.sh[:, :1], shs=raw.sh[:, 1:])
+    assert all(torch.equal(a, b) for a, b in zip(whole, parts, strict=True))
+    flat = settings_of(raw, sh_degree=0, antialiasing=False)
+    assert torch.equal(call_today(raw, flat, dc=raw.sh[:, :1])[0], call_today(raw, flat, shs=raw.sh[:, :1])[0])
+    with pytest.raises(InputError, match=r"dc: expected shape \[60, 1, 3\]"):
+        call_today(raw, settings, dc=raw.sh, shs=raw.sh)
+
+
+def test_sparse_adam_moves_what_was_seen():
+    """Against the update written out for one number: no bias correction, unseen rows keep value and moments."""
+    values = torch.tensor([[1.0, 2.0], [3.0, 4.0], [5.0, 6.0]], requires_grad=True)
+    optimizer = SparseGaussianAdam([{"params": [values], "lr": 0.1, "name": "xyz"}], lr=0.0, eps=1e-15)
+    expected, moments = values.detach().clone(), torch.zeros(2, 3, 2)
+    for step, seen in enumerate(([True, False, True], [True, True, False], [False, True, True])):
+        values.grad = torch.tensor([[0.5, -1.0], [2.0, 0.25], [-4.0, 1.0]]) * (step + 1)
+        optimizer.step(torch.tensor(seen), 3)
+        for row in range(3):
+            for column in range(2):
+                if seen[row]:
+                    g = values.grad[row, column]
+                    moments[0, row, column] = 0.9 * moments[0, row, column] + 0.1 * g
+                    moments[1, row, column] = 0.999 * moments[1, row, column] + 0.001 * g * g
+                    first, second = moments[:, row, column]
+                    expected[row, column] -= 0.1 * first / (second.sqrt() + 1e-15)
+    assert torch.allclose(values.detach(), expected, rtol=1e-5)
+    with pytest.raises(InputError, match="expected one tensor of 5 rows"):
+        optimizer.step(torch.ones(5, dtype=torch.bool), 5)

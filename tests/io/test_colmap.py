@@ -24,6 +24,13 @@ MODELS = {  # number in the binary format, from the list in COLMAP's documentati
     "SIMPLE_RADIAL_FISHEYE": 8,
     "RADIAL_FISHEYE": 9,
     "THIN_PRISM_FISHEYE": 10,
+    "RAD_TAN_THIN_PRISM_FISHEYE": 11,
+    "SIMPLE_DIVISION": 12,
+    "DIVISION": 13,
+    "SIMPLE_FISHEYE": 14,
+    "FISHEYE": 15,
+    "EUCM": 16,
+    "EQUIRECTANGULAR": 17,
 }
 PINHOLE = (1, "PINHOLE", 32, 24, [50.0, 55.0, 14.5, 12.25])
 AXIS_ANGLE = np.array([0.3, -0.5, 0.2])
@@ -185,12 +192,21 @@ def test_distorted_models(dataset, tmp_path, model, values, radial):
 
 
 @pytest.mark.parametrize("form", ["bin", "txt"])
-@pytest.mark.parametrize(("model", "count"), [("FOV", 5), ("THIN_PRISM_FISHEYE", 12)])
-def test_unsupported_model_is_named(dataset, form, model, count):
-    with pytest.raises(
-        InputError, match=rf"cameras\.{form}: camera 3: model {model} is not supported \(supported: .*PIN"
-    ):
-        read_colmap(dataset([(3, model, 32, 24, [1.0] * count)], [image(camera=3)], form))
+def test_unsupported_model_is_named(dataset, form):
+    message = rf"cameras\.{form}: camera 3: model EQUIRECTANGULAR is not supported \(supported: .*PIN.*panoramas"
+    panorama = (3, "EQUIRECTANGULAR", 32, 24, [32.0, 24.0])
+    with pytest.raises(InputError, match=message):
+        read_colmap(dataset([panorama], [image(camera=3)], form))
+
+
+@pytest.mark.parametrize("form", ["bin", "txt"])
+def test_camera_that_cannot_be_used_costs_its_photographs(dataset, caplog, form):
+    panorama = (3, "EQUIRECTANGULAR", 32, 24, [32.0, 24.0])
+    path = dataset([PINHOLE, panorama], [image("a.png"), image("b.png", camera=3)], form)
+    with caplog.at_level(logging.WARNING, logger="sgwarp"):
+        assert [view.stem for view in read_colmap(path)] == ["a"]
+    assert "left out 1 images that cannot be used, first: " in caplog.text
+    assert "model EQUIRECTANGULAR is not supported" in caplog.text
 
 
 def test_unknown_model_number(dataset):
@@ -205,7 +221,9 @@ def test_singular_intrinsics(dataset, form):
         read_colmap(dataset([camera], [image(camera=4)], form))
 
 
-@pytest.mark.parametrize(("factor", "size"), [(2, (1643, 2473)), (4, (822, 1237)), (4, (821, 1236)), (8, (411, 618))])
+@pytest.mark.parametrize(
+    ("factor", "size"), [(2, (1643, 2473)), (4, (822, 1237)), (4, (821, 1236)), (8, (411, 618)), (3.3, (996, 1499))]
+)
 def test_smaller_photographs_scale_the_camera(dataset, tmp_path, factor, size):
     """Sizes as in Mip-NeRF 360 (4946 x 3286), rounded up or down by the tool that made them."""
     camera = (1, "PINHOLE", 4946, 3286, [4000.0, 4100.0, 2473.0, 1643.0])
@@ -218,10 +236,63 @@ def test_smaller_photographs_scale_the_camera(dataset, tmp_path, factor, size):
     assert view.image_path.samefile(tmp_path / f"images_{factor}" / "a.png")
 
 
-@pytest.mark.parametrize("size", [(24, 16), (12, 32), (48, 64), (20, 30), (23, 32)])
+@pytest.mark.parametrize("size", [(24, 16), (12, 32), (32, 24), (20, 30), (23, 32)])
 def test_photograph_of_another_size(dataset, size):
     with pytest.raises(InputError, match=rf"a\.png: image is {size[1]} x {size[0]}, its camera says 32 x 24"):
         read_colmap(dataset([PINHOLE], [image()], size=size))
+
+
+def test_larger_photographs_scale_the_camera(dataset):
+    (view,) = read_colmap(dataset([PINHOLE], [image()], size=(48, 64)))
+    assert view.camera.size == (48, 64)
+    assert view.camera.K.tolist() == [[100.0, 0, 29.0], [0, 110.0, 24.5], [0, 0, 1]]
+
+
+def test_photograph_of_another_shape_is_left_out(dataset, tmp_path, caplog):
+    path = dataset([PINHOLE], [image("a.png"), image("b.png")])
+    cv2.imwrite(str(tmp_path / "images" / "b.png"), np.zeros((24, 25, 3), np.uint8))
+    with caplog.at_level(logging.WARNING, logger="sgwarp"):
+        assert [view.stem for view in read_colmap(path)] == ["a"]
+    assert "b.png: image is 25 x 24, its camera says 32 x 24" in caplog.text
+
+
+def test_largest_of_several_models_is_read(dataset, tmp_path, caplog):
+    dataset([PINHOLE], [image("a.png")], folder="sparse/0")
+    dataset([PINHOLE], [image("b.png"), image("c.png")], folder="sparse/1", form="txt")
+    (tmp_path / "sparse" / "1" / "points3D.txt").write_text(points_txt(POINTS))
+    with caplog.at_level(logging.WARNING, logger="sgwarp"):
+        assert [view.stem for view in read_colmap(tmp_path)] == ["b", "c"]
+    assert "holds 2 models (0 with 1, 1 with 2 images); the one with most images is read, 1" in caplog.text
+    assert len(read_points(tmp_path)[0]) == len(POINTS)
+    assert [view.stem for view in read_colmap(tmp_path / "sparse" / "0")] == ["a"]
+
+
+def test_text_without_lines_of_observations(dataset, tmp_path):
+    """Other tools leave out the empty line below an image, or put more between them, and start with a mark."""
+    dataset([PINHOLE], [image("a.png"), image("b 1.png"), image("c.png")], "txt")
+    rows = images_txt([image("a.png"), image("b 1.png"), image("c.png", observations=1)]).splitlines()[2:]
+    text = "\ufeff# made elsewhere\r\n" + "\r\n".join([rows[0], rows[2], "", "", rows[4], rows[5]])
+    (tmp_path / "sparse" / "0" / "images.txt").write_bytes(text.encode())
+    (tmp_path / "sparse" / "0" / "cameras.txt").write_text("1 pinhole 32.0 24.0 50 55 14.5 12.25\n")
+    assert [view.stem for view in read_colmap(tmp_path)] == ["a", "b 1", "c"]
+
+
+def test_sideways_photograph_is_turned_where_only_that_fits(dataset, tmp_path, caplog):
+    path = dataset([PINHOLE], [image("a.jpg"), image("b.jpg"), image("c.jpg")])
+    upright = np.zeros((24, 32, 3), np.uint8)
+    upright[:12] = 255  # white above
+    for name, raster, orientation in (("a", upright, 1), ("b", np.rot90(upright, 1), 6), ("c", upright, 3)):
+        data = cv2.imencode(".jpg", np.ascontiguousarray(raster))[1].tobytes()
+        note = b"Exif\0\0II*\0" + struct.pack("<IHHHIII", 8, 1, 0x0112, 3, 1, orientation, 0)
+        segment = b"\xff\xe1" + struct.pack(">H", len(note) + 2) + note
+        (tmp_path / "images" / f"{name}.jpg").write_bytes(data[:2] + segment + data[2:])
+    with caplog.at_level(logging.WARNING, logger="sgwarp"):
+        views = read_colmap(path)
+    assert "turned 1 photographs upright" in caplog.text
+    assert "1 photographs note an EXIF orientation (first c.jpg: 3, upside down)" in caplog.text
+    for view in views:  # an orientation that both fit is not applied: cameras belong to the stored raster
+        assert view.image()[2].mean() > 0.95
+        assert view.image()[-2].mean() < 0.05
 
 
 def test_missing_photographs_are_counted(dataset, caplog):
@@ -318,7 +389,7 @@ def test_points(tmp_path, form):
     xyz, rgb = read_points(path)
     assert xyz.tolist() == [list(p[0]) for p in POINTS]
     assert rgb.tolist() == [list(p[1]) for p in POINTS]
-    assert (xyz.dtype, rgb.dtype) == (np.float64, np.uint8)
+    assert (xyz.dtype, rgb.dtype) == (np.float64, np.float64)
     assert np.array_equal(read_points(tmp_path / "sparse")[0], xyz)
     (tmp_path / "sparse" / "cameras.txt").write_text("1 PINHOLE 32 24 50 50 16 12\n")
     assert np.array_equal(read_points(tmp_path)[0], xyz)

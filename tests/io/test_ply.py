@@ -95,11 +95,102 @@ def test_integer_columns_are_numbers(tmp_path, ply_bytes):
     assert_scene(read_ply(scene_file(ply_bytes, tmp_path / "a.ply", rows, CORE, kinds)), rows, 0)
 
 
-def test_extra_columns_are_named_and_left_out(tmp_path, ply_bytes, caplog):
-    rows = raw_rows([*CORE, "nx", "ny", "nz", "object_id"])
+def test_other_columns_are_kept_and_written_back(tmp_path, ply_bytes, caplog):
+    rows = raw_rows([*CORE, "nx", "ny", "nz", "confidence"])
+    for i, row in enumerate(rows):
+        row["instance"] = 70000 + i
+    kinds = ["float"] * (len(CORE) + 3) + ["double", "int"]
     with caplog.at_level(logging.WARNING, logger="sgwarp"):
-        read_ply(scene_file(ply_bytes, tmp_path / "a.ply", rows))
-    assert [record.getMessage() for record in caplog.records] == [f"{tmp_path / 'a.ply'}: columns left out: object_id"]
+        scene = read_ply(scene_file(ply_bytes, tmp_path / "a.ply", rows, kinds=kinds))
+    assert not caplog.records
+    assert {name: column.dtype.kind for name, column in scene.extras.items()} == {"confidence": "f", "instance": "i"}
+    write_ply(scene.subset(torch.tensor([3, 1])), tmp_path / "b.ply")
+    written = read_elements(tmp_path / "b.ply")["vertex"]
+    assert written["instance"].tolist() == [70003, 70001]
+    assert written["confidence"].tolist() == [rows[3]["confidence"], rows[1]["confidence"]]
+    assert written.dtype["confidence"] == "<f8"
+    assert read_ply(tmp_path / "b.ply").means.tolist() == scene.means[[3, 1]].tolist()
+
+
+def test_two_scales_are_flat_gaussians(tmp_path, ply_bytes, caplog):
+    """2D Gaussian Splatting writes no scale_2; the third axis is the normal."""
+    rows = raw_rows(CORE)
+    names = [name for name in CORE if name != "scale_2"]
+    with caplog.at_level(logging.WARNING, logger="sgwarp"):
+        scene = load_gaussians(scene_file(ply_bytes, tmp_path / "a.ply", rows, names))
+    assert "has two scales a Gaussian (2DGS)" in caplog.text
+    assert scene.scales[:, 2].tolist() == [0.0] * len(rows)
+    assert scene.scales[:, 1].tolist() == pytest.approx([math.exp(row["scale_1"]) for row in rows])
+    assert scene.quats.tolist() == [[row[f"rot_{k}"] for k in range(4)] for row in rows]
+    save_gaussians(scene, tmp_path / "b.ply")
+    assert load_gaussians(tmp_path / "b.ply").scales.tolist() == scene.scales.tolist()
+
+
+@pytest.mark.parametrize(
+    ("kind", "values", "white"),
+    [
+        ("uchar", [0, 51, 255], 255),
+        ("ushort", [0, 13107, 65535], 65535),
+        ("ushort", [0, 51, 255], 255),
+        ("int", [0, 51, 255], 255),
+        ("float", [0.0, 0.25, 1.0], 1),
+        ("float", [0.0, 63.75, 255.0], 255),
+        ("double", [0.0, 16383.75, 65535.0], 65535),
+    ],
+)
+@pytest.mark.parametrize("names", [("red", "green", "blue"), ("R", "G", "B")])
+def test_plain_colors(tmp_path, ply_bytes, kind, values, white, names):
+    rows = [row | dict(zip(names, values, strict=True)) for row in raw_rows(CORE)]
+    columns = [name for name in CORE if not name.startswith("f_dc")] + list(names)
+    kinds = ["float"] * (len(columns) - 3) + [kind] * 3
+    scene = load_gaussians(scene_file(ply_bytes, tmp_path / "a.ply", rows, columns, kinds))
+    assert scene.sh.shape == (len(rows), 1, 3)
+    assert scene.extras is None
+    colors = scene.sh[0, 0] * 0.28209479177387814 + 0.5
+    assert colors.tolist() == pytest.approx([value / white for value in values], abs=1e-6)
+
+
+def test_filter_of_mip_splatting_is_applied(tmp_path, ply_bytes):
+    rows = raw_rows([*CORE, "filter_3D"])
+    for row in rows:
+        row["filter_3D"] = 0.5
+    scene = load_gaussians(scene_file(ply_bytes, tmp_path / "a.ply", rows))
+    assert scene.extras is None
+    for i, row in enumerate(rows):
+        before = [math.exp(row[f"scale_{k}"]) for k in range(3)]
+        after = [math.sqrt(scale**2 + 0.25) for scale in before]
+        assert scene.scales[i].tolist() == pytest.approx(after, rel=1e-5)
+        faded = math.prod(before) / math.prod(after) / (1 + math.exp(-row["opacity"]))
+        assert scene.opacities[i].item() == pytest.approx(faded, rel=1e-5)
+
+
+def test_degree_four_is_cut_to_three(tmp_path, ply_bytes, caplog):
+    names = CORE + [f"f_rest_{i}" for i in range(72)]
+    rows = raw_rows(names)
+    with caplog.at_level(logging.WARNING, logger="sgwarp"):
+        scene = load_gaussians(scene_file(ply_bytes, tmp_path / "a.ply", rows))
+    assert "harmonics of degree 4; up to 3 are kept" in caplog.text
+    assert scene.sh[0, 1:, 1].tolist() == [rows[0][f"f_rest_{24 + i}"] for i in range(15)]
+
+
+@pytest.mark.parametrize(
+    ("names", "what"),
+    [
+        (["x", "y", "z", "f_offset_0", "f_anchor_feat_0", "opacity", "scale_0", "rot_0"], "Scaffold-GS"),
+        ([*CORE, "trbf_center", "motion_0"], "SpacetimeGaussians, which moves"),
+        (["x", "y", "z", "sb_params_0", "opacity"], "Deformable Beta Splatting"),
+    ],
+)
+def test_relatives_are_named(tmp_path, ply_bytes, names, what):
+    with pytest.raises(InputError, match=rf"a\.ply: is a.* {what}.*, not a 3DGS scene; "):
+        load_gaussians(scene_file(ply_bytes, tmp_path / "a.ply", raw_rows(names)))
+
+
+def test_mesh_is_told_apart(tmp_path, ply_bytes):
+    vertex = ("vertex", [("float", n) for n in "xyz"], [[0.0, 1.0, 2.0]])
+    (tmp_path / "a.ply").write_bytes(ply_bytes([vertex, ("face", [("int", "a")], [[0]])]))
+    with pytest.raises(InputError, match=r"a\.ply: is a mesh, not a 3DGS scene"):
+        load_gaussians(tmp_path / "a.ply")
 
 
 def test_other_elements_are_ignored(tmp_path, ply_bytes):
@@ -224,7 +315,7 @@ def test_missing_columns_are_named(tmp_path, ply_bytes):
 
 def test_point_cloud_is_told_apart(tmp_path, ply_bytes):
     path = scene_file(ply_bytes, tmp_path / "a.ply", raw_rows(["x", "y", "z", "red"]))
-    with pytest.raises(InputError, match=r"a\.ply: is a point cloud or mesh, not a 3DGS scene: no columns f_dc_0"):
+    with pytest.raises(InputError, match=r"a\.ply: is a point cloud, not a 3DGS scene; fit a scene"):
         load_gaussians(path)
 
 
@@ -274,9 +365,22 @@ def test_missing_file_folder_and_foreign(tmp_path):
     assert str(caught.value) == f"{tmp_path / 'none.ply'}: no such file; check the path"
     with pytest.raises(InputError, match="is a folder"):
         load_gaussians(tmp_path)
-    (tmp_path / "a.ply").write_bytes(b"glTF\x02\0\0\0")
+    (tmp_path / "a.ply").write_bytes(b"BM\x02\0\0\0")
     with pytest.raises(InputError, match=r"a\.ply: is not a valid PLY file"):
         load_gaussians(tmp_path / "a.ply")
+    for name, message in (
+        ("a.ksplat", r"is \.ksplat .*; convert it to \.ply or \.spz with splat-transform"),
+        ("a.las", r"is a point cloud \(\.las\), which is not read; fit a scene"),
+        ("a.usdz", "is USD"),
+        ("a.bin", r"nor a scene of another format that is read \(\.compressed\.ply, \.ply, \.spz, \.splat, \.glb"),
+        ("a.json", "is no scene of Gaussians"),
+    ):
+        (tmp_path / name).write_bytes(b"\0\1\2")
+        with pytest.raises(InputError, match=rf"{name}: .*{message}"):
+            load_gaussians(tmp_path / name)
+    (tmp_path / "a.json").write_text('{"frames": []}')
+    with pytest.raises(InputError, match=r"a\.json: holds cameras, not a scene; .*--views"):
+        load_gaussians(tmp_path / "a.json")
 
 
 @pytest.mark.parametrize(
@@ -304,8 +408,18 @@ def test_name_chooses_the_format(tmp_path):
     assert torch.equal(load_gaussians(tmp_path / "a.PLY").means, before.means)
     save_gaussians(before, tmp_path / "deep" / "a.compressed.ply")
     assert b"element chunk 1\n" in (tmp_path / "deep" / "a.compressed.ply").read_bytes()
-    with pytest.raises(InputError, match=r"a\.splat: scenes are written as \.ply"):
-        save_gaussians(before, tmp_path / "a.splat")
+    with pytest.raises(InputError, match=r"a\.sog: scenes are written as .*\.ply, \.spz, \.splat, \.glb; change"):
+        save_gaussians(before, tmp_path / "a.sog")
+    for name in ("b.spz", "b.splat", "b.glb"):
+        save_gaussians(before, tmp_path / name)
+        (tmp_path / name).rename(tmp_path / (name if name == "b.splat" else "c.ply"))  # told apart by content
+        after = load_gaussians(tmp_path / ("b.splat" if name == "b.splat" else "c.ply"))
+        assert (after.means - before.means).abs().max() < 2e-4
+        save_gaussians(before, tmp_path / name, axes="luf")
+        turned = load_gaussians(tmp_path / name, axes="ldf")  # said wrong: up and down, forward and back differ
+        assert (turned.means - before.means * torch.tensor([1.0, -1.0, 1.0])).abs().max() < 2e-4
+    with pytest.raises(InputError, match="axes 'xyz': expected R or L"):
+        load_gaussians(tmp_path / "a.PLY", axes="xyz")
 
 
 @settings(deadline=None, max_examples=150)

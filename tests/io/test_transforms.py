@@ -1,6 +1,7 @@
 import json
 import logging
 import math
+import re
 
 import cv2
 import numpy as np
@@ -72,6 +73,7 @@ def test_view(dataset, tmp_path):
 
 def test_frame_wins_over_file(dataset):
     path = dataset([frame("a.png"), frame("b.png", fl_x=70.0, cx=20.0, w=40)], **SHARED)
+    cv2.imwrite(str(path.parent / "b.png"), np.zeros((24, 40, 3), np.uint8))
     a, b = (view.camera for view in read_transforms(path))
     assert a.K.tolist() == [[50, 0, 14.5], [0, 55, 12.25], [0, 0, 1]]
     assert b.K.tolist() == [[70, 0, 20], [0, 55, 12.25], [0, 0, 1]]
@@ -151,10 +153,13 @@ def test_poses_that_are_not_finite_are_counted(dataset, caplog, value):
         ([[10**400] * 4] * 4, r"'transform_matrix' must be 4 x 4 numbers"),
     ],
 )
-def test_bad_pose_names_the_frame(dataset, matrix, message):
-    path = dataset([frame("0.png"), frame("1.png", matrix)], **SHARED)
-    with pytest.raises(InputError, match=r"transforms\.json: frame 1 \(1\.png\): .*" + message):
-        read_transforms(path)
+def test_bad_pose_names_the_frame(dataset, caplog, matrix, message):
+    with pytest.raises(InputError, match=r"transforms\.json: frame 0 \(1\.png\): .*" + message):
+        read_transforms(dataset([frame("1.png", matrix)], **SHARED))
+    with caplog.at_level(logging.WARNING, logger="sgwarp"):
+        views = read_transforms(dataset([frame("0.png"), frame("1.png", matrix)], **SHARED))
+    assert [view.stem for view in views] == ["0"]
+    assert re.search(r"left out 1 frames .*frame 1 \(1\.png\): .*" + message, caplog.text)
 
 
 def test_three_rows_are_enough(dataset):
@@ -190,7 +195,7 @@ def test_singular_intrinsics(dataset):
         ({"fl_x": 50, "w": 32, "h": 24.5}, "'h' must be a positive whole number"),
         ({**SHARED, "camera_model": "EQUIRECTANGULAR"}, "camera_model 'EQUIRECTANGULAR' is not supported"),
         ({**SHARED, "camera_model": ["OPENCV"]}, r"camera_model \['OPENCV'\] is not supported"),
-        ({**SHARED, "k4": 0.1}, "'k4' is only defined for camera_model OPENCV_FISHEYE"),
+        ({**SHARED, "k4": 0.1}, "'k4' is not defined for camera_model OPENCV;"),
         ({**SHARED, "k1": -50.0}, "distortion .* folds the image"),
         ({**SHARED, "fl_x": 10**400}, "'fl_x' must be a number"),
     ],
@@ -208,11 +213,35 @@ def test_cameras_alone_need_a_size(dataset):
 
 def test_photograph_of_another_size(dataset):
     (view,) = read_transforms(dataset([frame()], size=(12, 16), **SHARED))
-    with pytest.raises(InputError, match=r"images/0\.png: image is 16 x 12, its camera says 32 x 24"):
-        view.image()
-    (view,) = read_transforms(dataset([frame()], size=(12, 16), k1=-0.1, **SHARED))
-    with pytest.raises(InputError, match=r"images/0\.png: image is 16 x 12, its camera says 32 x 24"):
-        view.image()
+    assert view.camera.K.tolist() == [[25.0, 0, 7.25], [0, 27.5, 6.125], [0, 0, 1]]
+    for distortion in ({}, {"k1": -0.1}):
+        with pytest.raises(InputError, match=r"images/0\.png: image is 16 x 16, its camera says 32 x 24"):
+            read_transforms(dataset([frame()], size=(16, 16), **distortion, **SHARED))
+
+
+def test_each_photograph_has_its_own_size(dataset):
+    path = dataset([frame("a.png"), frame("b.png")], camera_angle_x=0.8)
+    cv2.imwrite(str(path.parent / "b.png"), np.zeros((48, 80, 3), np.uint8))
+    a, b = (view.camera for view in read_transforms(path))
+    assert (a.size, b.size) == ((24, 32), (48, 80))
+    assert a.K[0, 0].item() == pytest.approx(16 / math.tan(0.4))
+    assert b.K.flatten().tolist() == pytest.approx([40 / math.tan(0.4), 0, 40, 0, 40 / math.tan(0.4), 24, 0, 0, 1])
+
+
+def test_files_that_a_frame_names(dataset, tmp_path, caplog):
+    (tmp_path / "masks").mkdir()
+    (tmp_path / "masks" / "0.png").write_bytes(b"")
+    own = {"mask_path": "masks/0.png", "depth_file_path": "gone.png"}
+    path = dataset(
+        [frame("0.png", mask_path="masks/0.png"), frame("1.png", **own)], **SHARED, train_filenames=["0.png"]
+    )
+    with caplog.at_level(logging.WARNING, logger="sgwarp"):
+        view, other = read_transforms(path)
+    assert view.mask_path == other.mask_path == tmp_path / "masks" / "0.png"
+    assert other.depth_path is None
+    assert view.name == "0.png"
+    assert "1 of 1 files that its frames name as depth_file_path do not exist, first gone.png" in caplog.text
+    assert "not used: train_filenames" in caplog.text
 
 
 @pytest.mark.parametrize("model", [None, "OPENCV", "OPENCV_FISHEYE"])

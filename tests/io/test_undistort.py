@@ -12,14 +12,14 @@ W, H = 96, 64
 BARREL = Lens(70.0, 72.0, 50.0, 30.0, W, H, (-0.2, 0.03, 0.002, -0.003))
 PINCUSHION = Lens(70.0, 72.0, 45.0, 33.0, W, H, (0.15, 0.02, -0.001, 0.002, 0.01))
 RATIONAL = Lens(70.0, 70.0, 48.0, 32.0, W, H, (0.3, -0.1, 0.001, 0.001, 0.01, 0.45, -0.05, 0.002))
-FISHEYE = Lens(55.0, 56.0, 47.0, 34.0, W, H, (0.02, -0.01, 0.003, -0.001), fisheye=True)
-EQUIDISTANT = Lens(60.0, 60.0, 48.0, 32.0, W, H, fisheye=True)
+FISHEYE = Lens(55.0, 56.0, 47.0, 34.0, W, H, (0.02, -0.01, 0.003, -0.001), model="fisheye")
+EQUIDISTANT = Lens(60.0, 60.0, 48.0, 32.0, W, H, model="fisheye")
 LENSES = [BARREL, PINCUSHION, RATIONAL, FISHEYE, EQUIDISTANT]
 
 
 def distorted(lens, x, y):
     """Pixel of the stored photograph that sees direction (x, y, 1), written out from the definition of the models."""
-    if lens.fisheye:
+    if lens.model == "fisheye":
         k = [1.0, *lens.distortion, 0.0, 0.0, 0.0, 0.0]
         r = np.hypot(x, y)
         theta = np.arctan(r)
@@ -98,7 +98,7 @@ def test_nearest_mixes_no_ids():
 
 
 def test_fisheye_that_sees_behind_itself_is_cropped():
-    K = pinhole_matrix(Lens(15.0, 15.0, 48.0, 32.0, W, H, fisheye=True))  # 183 degrees
+    K = pinhole_matrix(Lens(15.0, 15.0, 48.0, 32.0, W, H, model="fisheye"))  # 183 degrees
     assert K[0, 0] == pytest.approx(7.5)
 
 
@@ -119,7 +119,7 @@ def test_photograph_of_another_size():
     "lens",
     [
         Lens(30.0, 30.0, 48.0, 32.0, W, H, (-5.0, 0.0, 0.0, 0.0)),
-        Lens(30.0, 30.0, 48.0, 32.0, W, H, (-9.0, 0.0, 0.0, 0.0), fisheye=True),
+        Lens(30.0, 30.0, 48.0, 32.0, W, H, (-9.0, 0.0, 0.0, 0.0), model="fisheye"),
         Lens(30.0, 30.0, 48.0, 32.0, W, H, (1e6, -1e9, 0.0, 0.0)),
     ],
 )

@@ -15,3 +15,7 @@ from sgwarp.compat.gsplat.pixels import rasterize_to_pixels as rasterize_to_pixe
 from sgwarp.compat.gsplat.pixels import spherical_harmonics as spherical_harmonics
 from sgwarp.compat.gsplat.projection import fully_fused_projection as fully_fused_projection
 from sgwarp.compat.gsplat.projection import quat_scale_to_covar_preci as quat_scale_to_covar_preci
+from sgwarp.compat.gsplat.relocation import compute_relocation as compute_relocation
+from sgwarp.compat.gsplat.surfels import fully_fused_projection_2dgs as fully_fused_projection_2dgs
+from sgwarp.compat.gsplat.surfels import rasterization_2dgs as rasterization_2dgs
+from sgwarp.compat.gsplat.surfels import rasterize_to_pixels_2dgs as rasterize_to_pixels_2dgs

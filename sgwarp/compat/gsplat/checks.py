@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from typing import Any
 
+import torch
 from torch import Tensor
 
 from sgwarp.errors import InputError
@@ -24,6 +25,14 @@ def expect_shape(name: str, tensor: Any, *shapes: tuple[int | None, ...]) -> Non
         if len(shape) == tensor.ndim and all(w in (None, s) for w, s in zip(shape, tensor.shape, strict=True)):
             return
     raise InputError(f"{name}: expected shape {wanted}, got {list(tensor.shape)}")
+
+
+def widen(*tensors: Any) -> tuple[Any, ...]:
+    """Half-precision tensors as float32, with gradients in their own type; everything else as it is."""
+    return tuple(
+        t.to(torch.float32) if isinstance(t, Tensor) and t.dtype in (torch.float16, torch.bfloat16) else t
+        for t in tensors
+    )
 
 
 def expect_choice(name: str, value: Any, choices: tuple[str, ...]) -> None:

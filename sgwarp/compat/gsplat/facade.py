@@ -13,7 +13,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from sgwarp.compat.gsplat.checks import expect_choice, expect_shape, expect_tile_size, refuse
+from sgwarp.compat.gsplat.checks import expect_choice, expect_shape, expect_tile_size, refuse, widen
 from sgwarp.compat.gsplat.meta import Images, ListTable, SplatTable
 from sgwarp.compat.gsplat.pixels import accumulate as accumulate
 from sgwarp.compat.gsplat.pixels import expect_degree
@@ -106,6 +106,7 @@ def rasterization(
         camera_model: "pinhole", "ortho" or "fisheye".
         covars: Covariances [m^2] instead of `quats` and `scales`, [..., N, 3, 3].
 
+    Tensors of half precision are computed with in float32, and so are the images; gradients come in their own type.
     Not supported are distributed, with_ut, with_eval3d, radial_coeffs, tangential_coeffs, thin_prism_coeffs,
     ftheta_coeffs, viewmats_rs and rolling shutters.
 
@@ -129,6 +130,8 @@ def rasterization(
         rolling_shutter=None if getattr(rolling_shutter, "name", "") == "GLOBAL" else rolling_shutter,
         viewmats_rs=viewmats_rs,
     )
+    means, quats, scales, opacities, colors = widen(means, quats, scales, opacities, colors)
+    viewmats, Ks, backgrounds, covars = widen(viewmats, Ks, backgrounds, covars)
     expect_tile_size(tile_size)
     expect_choice("render_mode", render_mode, RENDER_MODES)
     expect_choice("rasterize_mode", rasterize_mode, RASTERIZE_MODES)

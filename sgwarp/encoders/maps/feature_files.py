@@ -14,6 +14,7 @@ from sgwarp.errors import InputError
 from sgwarp.files.arrays import read_array, read_arrays
 from sgwarp.files.tensors import read_tensors
 from sgwarp.files.torch_files import load_torch
+from sgwarp.io.undistort import same_shape as same_shape
 
 FEATURE_SUFFIXES = (".npy", ".npz", ".pt", ".pth", ".safetensors")
 FEATURE_KEYS = ("features", "feat", "dense", "arr_0")  # of files that hold more than one array
@@ -65,12 +66,6 @@ def channels_last(path: Path, features: Tensor, size: tuple[int, int], layout: L
     if not any(fits.values()):
         raise InputError(f"{path}: {[a, b, c]} does not have the shape of the view, {view}, as chw or as hwc")
     return features.movedim(0, 2) if (layout or ("chw" if fits["chw"] else "hwc")) == "chw" else features
-
-
-def same_shape(small: tuple[int, int], size: tuple[int, int]) -> bool:
-    """Whether a map of `small` (h, w) covers a view of `size` (h, w) with square cells, up to rounding."""
-    (h, w), (height, width) = small, size
-    return abs(h - w * height / width) <= 1 or abs(w - h * width / height) <= 1
 
 
 def _load_tensors(path: Path) -> dict[str, Tensor]:

@@ -7,6 +7,10 @@
 | {stem}_fmap_CxHxW.pt | features [C, h, w] (Feature 3DGS) | dense map |
 | {stem}_s.npy with {stem}_f.npy | ids [L, h, w], -1 = none; vectors [M, C] (LangSplat) | id map of L levels |
 
+Files are found by the photograph's name, however it is spelled: `sgwarp.io.companions` has the list. What they hold
+belongs to the photograph as it is stored: it is turned and undistorted with it, unless the option `straight=yes` says
+that it was made for the undistorted image.
+
 A file space.json or meta.json beside them, {"space": "..."}, names the embedding space of the features.
 """
 
@@ -15,7 +19,7 @@ from __future__ import annotations
 import os
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Literal
+from typing import Any, Literal
 
 import numpy as np
 import torch
@@ -35,6 +39,7 @@ from sgwarp.errors import InputError
 from sgwarp.files.arrays import read_array
 from sgwarp.files.documents import read_json
 from sgwarp.files.images import read_ids
+from sgwarp.io.companions import Companions
 from sgwarp.scene import FeatureMap, View
 
 LABEL_SPACE = "labels"
@@ -52,6 +57,7 @@ class FileMaps:
         views: The views that will be asked for. Label images share one set of channels: the ids found in all of them.
         layout: Where dense features have their channels, "chw" or "hwc"; if None, the view's shape decides.
         levels: Which levels of a LangSplat pair to keep, in this order; all of them if None.
+        straight: The files belong to the undistorted images, not to the photographs as stored.
 
     Raises:
         InputError: The folder is missing, holds no map of any view or maps of two kinds, or a file cannot be read.
@@ -66,13 +72,14 @@ class FileMaps:
         *,
         layout: Layout | None = None,
         levels: Sequence[int] | None = None,
+        straight: bool = False,
     ) -> None:
         self.folder = Path(folder)
         self.layout = layout
         self.levels = levels
-        if not self.folder.is_dir():
-            raise InputError(f"{self.folder}: no such folder; give the one that holds a file per view")
-        found = [(view, *self._find(view.stem)) for view in views if self.has_map(view)]
+        self.straight = straight
+        self.companions = Companions(folder, views)
+        found = [(view, *self._find(view)) for view in views if self.has_map(view)]
         if not found:
             names = ", ".join(f"{{stem}}{suffix}" for suffix in (".png", *FEATURE_SUFFIXES, CHANNELS_FIRST, "_s.npy"))
             raise InputError(f"{self.folder}: holds no map of any of the {len(views)} views; looked for {names}")
@@ -89,7 +96,7 @@ class FileMaps:
             MissingMap: The view has no file.
             InputError: A file cannot be read, or does not have the shape of the view.
         """
-        kind, path = self._find(view.stem)
+        kind, path = self._find(view)
         self._require_kind(kind, path)
         if kind == "labels":
             return FeatureMap(self.space, ids=self._label_channels(path, view), labels=self.labels)
@@ -99,23 +106,22 @@ class FileMaps:
         dense, valid = self._dense(path, view)
         return FeatureMap(self.space, dense=dense, valid=valid)
 
-    def _candidates(self, stem: str) -> list[tuple[Kind, Path]]:
+    def _candidates(self, view: View) -> list[tuple[Kind, Path]]:
         kinds: list[tuple[Kind, str]] = [("labels", ".png"), ("levels", "_s.npy")]
         kinds += [("dense", suffix) for suffix in (*FEATURE_SUFFIXES, CHANNELS_FIRST)]
-        files = [(kind, self.folder / f"{stem}{suffix}") for kind, suffix in kinds]
-        return [(kind, path) for kind, path in files if path.is_file()]
+        return [(kind, path) for kind, ending in kinds for path in self.companions.find(view, [ending])]
 
     def has_map(self, view: View) -> bool:
         """Whether the folder holds a file for the view; it is not opened."""
-        return bool(self._candidates(view.stem))
+        return bool(self._candidates(view))
 
-    def _find(self, stem: str) -> tuple[Kind, Path]:
+    def _find(self, view: View) -> tuple[Kind, Path]:
         """Kind of a view's map, and its (first) file."""
-        found = self._candidates(stem)
+        found = self._candidates(view)
         if not found:
-            raise MissingMap(f"{self.folder}: holds no map of view {stem}")
+            raise MissingMap(f"{self.folder}: holds no map of view {view.stem}")
         if len(found) > 1:
-            raise InputError(f"{found[0][1]}: view {stem} has another map, {found[1][1].name}; keep one of them")
+            raise InputError(f"{found[0][1]}: view {view.stem} has another map, {found[1][1].name}; keep one of them")
         return found[0]
 
     def _require_kind(self, kind: Kind, path: Path) -> None:
@@ -133,13 +139,13 @@ class FileMaps:
         return None
 
     def _channels(self, view: View) -> int:
-        kind, path = self._find(view.stem)
+        kind, path = self._find(view)
         return (self._levels(path, view)[1] if kind == "levels" else self._dense(path, view)[0]).shape[-1]
 
     def _label_channels(self, path: Path, view: View) -> Tensor:
         """Index into the labels at every pixel, -1 where unknown, int64 [h, w]."""
         assert self.labels is not None
-        ids = read_ids(path)
+        ids = self._carried(path, read_ids(path), view)
         _require_shape(path, ids.shape, view)
         known = np.array([0, *(int(label) for label in self.labels)])
         place = np.minimum(np.searchsorted(known, ids), len(known) - 1)
@@ -151,7 +157,28 @@ class FileMaps:
     def _dense(self, path: Path, view: View) -> tuple[Tensor, Tensor | None]:
         features, valid = load_features(path)
         layout = "chw" if path.name.endswith(CHANNELS_FIRST) else self.layout
-        return channels_last(path, features, view.camera.size, layout), valid
+        if self.straight or view.undistort is None:
+            return channels_last(path, features, view.camera.size, layout), valid
+        dense = channels_last(path, features, self._stored_size(view, features), layout)
+        smooth = self._carried(path, dense.to(torch.float32).numpy(), view, nearest=False)
+        known = None if valid is None else torch.from_numpy(self._carried(path, valid.numpy(), view))
+        return torch.from_numpy(np.ascontiguousarray(smooth)).to(dense.dtype), known
+
+    def _stored_size(self, view: View, features: Tensor) -> tuple[int, int]:
+        """(height, width) of the photograph as stored, or lying as the features do."""
+        height, width = view.camera.size
+        shape = tuple(features.shape)
+        stands = same_shape(shape[1:], (height, width)) or same_shape(shape[:2], (height, width))
+        return (height, width) if stands else (width, height)
+
+    def _carried(self, path: Path, array: Any, view: View, nearest: bool = True) -> Any:
+        """What belongs to the photograph as stored, as it belongs to the image of the view's camera."""
+        if self.straight:
+            return array
+        try:
+            return view.carry(array, nearest)
+        except InputError as error:
+            raise InputError(f"{path}: {error}") from None
 
     def _levels(self, path: Path, view: View) -> tuple[Tensor, Tensor]:
         """Ids, int64 [L, h, w], and vectors, float32 [M, C], of a LangSplat pair."""
@@ -163,6 +190,7 @@ class FileMaps:
                 raise InputError(f"{path}: has no level {level}; its levels are 0 to {len(ids) - 1}")
         if self.levels is not None:
             ids = ids[list(self.levels)]
+        ids = np.moveaxis(self._carried(path, np.moveaxis(ids, 0, 2), view), 2, 0)
         _require_shape(path, ids.shape[1:], view)
         other = path.with_name(path.name.removesuffix("_s.npy") + "_f.npy")
         vectors = read_array(other)
@@ -172,7 +200,7 @@ class FileMaps:
             raise InputError(
                 f"{path}: ids go from {ids.min():g} to {ids.max():g}, {other.name} has {len(vectors)} rows"
             )
-        return torch.from_numpy(ids.astype(np.int64)), torch.from_numpy(vectors.astype(np.float32))
+        return torch.from_numpy(np.ascontiguousarray(ids, np.int64)), torch.from_numpy(vectors.astype(np.float32))
 
 
 def _scene_labels(paths: Sequence[Path]) -> tuple[str, ...]:
@@ -191,8 +219,14 @@ def _require_shape(path: Path, shape: Sequence[int], view: View) -> None:
         raise InputError(f"{path}: is {shape[1]} x {shape[0]}, not the shape of view {view.stem} ({width} x {height})")
 
 
-def open_files(folder: str, views: Sequence[View], layout: str | None = None, levels: str | None = None) -> FileMaps:
-    """The source behind `files:DIR`, `files:DIR?layout=hwc` (or chw) and `files:DIR?levels=1,2,3`.
+def open_files(
+    folder: str,
+    views: Sequence[View],
+    layout: str | None = None,
+    levels: str | None = None,
+    straight: str | None = None,
+) -> FileMaps:
+    """The source behind `files:DIR`, with the options layout=hwc (or chw), levels=1,2,3 and straight=yes.
 
     Raises:
         InputError: An option has a wrong value, or as FileMaps.
@@ -203,7 +237,9 @@ def open_files(folder: str, views: Sequence[View], layout: str | None = None, le
         chosen = [int(level) for level in levels.split(",")] if levels else None
     except ValueError:
         raise InputError(f"files:{folder}: levels are numbers such as 1,2,3, not '{levels}'") from None
-    return FileMaps(folder, views, layout=layout, levels=chosen)  # type: ignore[arg-type]
+    if straight not in (None, "yes", "no"):
+        raise InputError(f"files:{folder}: straight is yes or no, not '{straight}'")
+    return FileMaps(folder, views, layout=layout, levels=chosen, straight=straight == "yes")  # type: ignore[arg-type]
 
 
 def make_source(member: Member, request: Request) -> MapSource:

@@ -9,7 +9,9 @@ from __future__ import annotations
 
 import hashlib
 import os
+from collections.abc import Sequence
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import torch
@@ -22,6 +24,7 @@ from sgwarp.errors import InputError
 from sgwarp.files.access import read_bytes
 from sgwarp.files.arrays import read_arrays
 from sgwarp.files.images import read_ids
+from sgwarp.io.companions import Companions
 from sgwarp.scene import View
 
 
@@ -29,7 +32,9 @@ class FileMasks:
     """A MaskGenerator that reads its masks.
 
     Args:
-        folder: Where the files are.
+        folder: Where the files are; they are found by the photographs' names (`sgwarp.io.companions`), and turned and
+            undistorted like the photographs.
+        views: The views that will be asked for; without them only plain stems are found.
 
     Raises:
         InputError: The folder is missing.
@@ -37,14 +42,14 @@ class FileMasks:
 
     identity = "masks of files"
 
-    def __init__(self, folder: str | os.PathLike[str]) -> None:
+    def __init__(self, folder: str | os.PathLike[str], views: Sequence[View] = ()) -> None:
         self.folder = Path(folder)
         if not self.folder.is_dir():
             raise InputError(f"{self.folder}: no such folder; give the one that holds {{stem}}.png or {{stem}}.npz")
+        self._companions = Companions(self.folder, views)
 
     def _path(self, view: View) -> Path:
-        found = [self.folder / f"{view.stem}{suffix}" for suffix in (".png", ".npz")]
-        there = [path for path in found if path.is_file()]
+        there = self._companions.find(view, (".png", ".npz"))
         if not there:
             raise MissingMap(f"{self.folder}: holds no {view.stem}.png or {view.stem}.npz")
         return there[0]
@@ -60,7 +65,7 @@ class FileMasks:
             InputError: The file cannot be read, or is not in the shape of the image.
         """
         path = self._path(view)
-        masks = _from_ids(path) if path.suffix == ".png" else _from_stack(path)
+        masks = _from_ids(path, view) if path.suffix.lower() == ".png" else _from_stack(path, view)
         (h, w), (height, width) = masks.masks.shape[1:], image.shape[:2]
         if abs(h * width - w * height) > max(height, width):
             raise InputError(f"{path}: is {w} x {h}, not the shape of view {view.stem} ({width} x {height})")
@@ -72,15 +77,23 @@ class FileMasks:
         )
 
 
-def _from_ids(path: Path) -> Masks:
-    ids = torch.from_numpy(read_ids(path))
+def _carried(path: Path, array: Any, view: View) -> Any:
+    """What belongs to the photograph as stored, as it belongs to the image of the view's camera."""
+    try:
+        return np.ascontiguousarray(view.carry(array))
+    except InputError as error:
+        raise InputError(f"{path}: {error}") from None
+
+
+def _from_ids(path: Path, view: View) -> Masks:
+    ids = torch.from_numpy(_carried(path, read_ids(path), view))
     labels = ids.unique()
     labels = labels[labels != 0]
     count = len(labels)
     return Masks(ids == labels[:, None, None], torch.ones(count), torch.full((count,), UNRANKED))
 
 
-def _from_stack(path: Path) -> Masks:
+def _from_stack(path: Path, view: View) -> Masks:
     arrays = read_arrays(path)
     if "masks" not in arrays or arrays["masks"].ndim != 3:
         raise InputError(f"{path}: expected an array masks [M, h, w]")
@@ -88,11 +101,12 @@ def _from_stack(path: Path) -> Masks:
     scores = torch.from_numpy(np.asarray(arrays.get("scores", np.ones(count)), np.float32))
     ranks = torch.from_numpy(np.asarray(arrays.get("ranks", np.full(count, UNRANKED)), np.int64))
     try:
-        return Masks(torch.from_numpy(arrays["masks"].astype(bool)), scores, ranks)
+        stack = _carried(path, np.moveaxis(arrays["masks"].astype(bool), 0, 2), view)
+        return Masks(torch.from_numpy(np.ascontiguousarray(np.moveaxis(stack, 2, 0))), scores, ranks)
     except InputError as error:
         raise InputError(f"{path}: {error}") from None
 
 
 def make_masks(part: Part, request: Request) -> MaskGenerator:
     """Masks from a folder."""
-    return FileMasks(part.argument)
+    return FileMasks(part.argument, request.views)

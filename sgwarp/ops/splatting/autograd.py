@@ -9,6 +9,7 @@ import torch
 from torch import Tensor
 
 from sgwarp.errors import InputError
+from sgwarp.ops.planar.harmonics import harmonics_sum
 from sgwarp.ops.splatting import backward, forward, tiles
 from sgwarp.ops.splatting.forward import Rendering, composite_recorded, packed_colors, require_finite
 from sgwarp.ops.splatting.plan import RenderPlan, plan_render
@@ -56,7 +57,8 @@ def rasterize(
         width: Image width [pixels].
         height: Image height [pixels].
         sh: Spherical-harmonic coefficients, float [N, K, 3]; colours are composited.
-        features: Any other values to composite, float [N, C]; exactly one of `sh` and `features` is given.
+        features: Any other values to composite, float [N, C]. With `sh` as well, the three colors come before them,
+            in one pass.
         background: Seen through what is left transparent, float [C]; None is zero.
         means2d: float [N, 2], added to the projected centres as far as gradients go: its values are not read, and its
             gradient is that of the projected centres [1 / pixels], which densification looks at.
@@ -88,8 +90,8 @@ def rasterize(
         None if value is None else dense(name, value)
         for name, value in (("sh", sh), ("features", features), ("background", background), ("means2d", means2d))
     )
-    if (sh is None) == (features is None):
-        raise InputError("give exactly one of sh [N, K, 3] and features [N, C]")
+    if sh is None and features is None:
+        raise InputError("give sh [N, K, 3], features [N, C], or both")
     if means2d is not None and tuple(means2d.shape) != (len(means), 2):
         raise InputError(f"means2d: expected shape [{len(means)}, 2], got {list(means2d.shape)}")
     if absgrad and means2d is None:
@@ -107,6 +109,9 @@ def rasterize(
         require_finite(features)
     if sh is not None and not (sh.ndim == 3 and sh.shape[1] in SH_COUNTS):
         raise InputError(f"sh: expected shape [{n}, 1, 4, 9 or 16, 3], got {list(sh.shape)}")
+    if sh is not None and features is not None:
+        features, sh = torch.cat([_colors(means, sh, viewmat), features.to(means)], dim=1), None
+        values = features
     channels = 3 if features is None else features.shape[1]
     if background is not None and tuple(background.shape) != (channels,):
         raise InputError(f"background: expected shape [{channels}], got {list(background.shape)}")
@@ -150,6 +155,14 @@ def rasterize(
     if expected_depth:
         mean_depth = torch.where(alpha > 0, depth_sum / alpha.clamp(min=1e-12), 0.0)
     return Rendering(image, alpha, mean_depth, surface if depth else None, request.status_counts)
+
+
+def _colors(means: Tensor, sh: Tensor, viewmat: Tensor) -> Tensor:
+    """Colors of the harmonics seen from the camera, [N, 3]; 0 where they are not finite, as nothing is rendered."""
+    pose = viewmat.to(means)
+    directions = means + pose[:3, 3] @ pose[:3, :3]  # the camera lies at -R^T t
+    degree = SH_COUNTS.index(sh.shape[1])
+    return torch.nan_to_num((harmonics_sum(directions, sh.to(means), degree) + 0.5).clamp(min=0.0), posinf=0.0)
 
 
 def _as_gaussians(*fields: Tensor) -> Gaussians:

@@ -3,9 +3,8 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import replace
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -13,16 +12,15 @@ import torch
 from torch import Tensor
 
 from sgwarp.errors import InputError
-from sgwarp.files.arrays import read_array
-from sgwarp.files.images import read_ids
 from sgwarp.ops.neighbors import mean_squared_neighbor_distance
 from sgwarp.reconstruction.depth import SH_C0
+from sgwarp.reconstruction.fitting.belongings import depth_from_folder as depth_from_folder
 from sgwarp.reconstruction.fitting.photographs import Photograph
 from sgwarp.reconstruction.fitting.settings import FitSettings
 from sgwarp.reconstruction.stereo import estimate_depth
 from sgwarp.runs.progress import Report
 from sgwarp.runs.seeds import generator
-from sgwarp.scene import SH_COUNTS, Gaussians, View
+from sgwarp.scene import SH_COUNTS, Gaussians
 
 logger = logging.getLogger("sgwarp")
 OPACITY = {"default": 0.1, "mcmc": 0.5}  # of the reference implementations
@@ -35,7 +33,6 @@ RANDOM_COUNT = 50_000
 SHARE_OF_CAP = 2  # so much of the cap is left to the fit: the half
 LEAST_CERTAIN = 500  # depths that are worth starting from
 NEAREST, FARTHEST = 0.2, 4.0  # of points anywhere [extent of the cameras]
-MILLIMETRE = 1e-3  # [m], the unit of depth images
 
 
 def gaussians_from_points(
@@ -175,18 +172,3 @@ def adapted(gaussians: Gaussians, settings: FitSettings) -> Gaussians:
             f"all Gaussians to start from are below an opacity of {VISIBLE:.4f}: no photograph would move them"
         )
     return replace(gaussians, sh=gaussians.sh[:, : SH_COUNTS[settings.sh_degree]])
-
-
-def depth_from_folder(folder: Path) -> Callable[[View], Any]:
-    """Depth of a view [m], [H, W], 0 where there is none: {stem}.npy in metres or {stem}.png in millimetres.
-
-    What is returned raises InputError if there is neither, or it cannot be read.
-    """
-
-    def depth(view: View) -> Any:
-        numbers = folder / f"{view.stem}.npy"
-        if not numbers.is_file():
-            return read_ids(folder / f"{view.stem}.png").astype(np.float32) * np.float32(MILLIMETRE)
-        return read_array(numbers)
-
-    return depth

@@ -13,7 +13,8 @@ import torch
 from torch import Tensor
 
 from sgwarp.errors import InputError
-from sgwarp.files.images import read_alpha, read_ids
+from sgwarp.files.images import read_alpha
+from sgwarp.reconstruction.fitting.belongings import masks_from_folder as masks_from_folder
 from sgwarp.reconstruction.fitting.pixels import PixelStore, StoredPixels
 from sgwarp.runs.progress import Report
 from sgwarp.scene import Camera, View
@@ -67,7 +68,7 @@ def read_photographs(
     device: str | torch.device = "cpu",
     progress: Report | None = None,
 ) -> list[Photograph]:
-    """Read all photographs that can be used; those whose mask leaves nothing are left out, with a notice.
+    """Read all photographs; those that cannot be used or whose mask leaves nothing are left out, with a notice.
 
     Args:
         views: Posed photographs.
@@ -76,7 +77,7 @@ def read_photographs(
         masks: Which pixels of a view count, [H, W] of its photograph, zero for those that do not; or None for all.
 
     Raises:
-        InputError: A photograph is missing, cannot be read, or does not have its camera's size; a mask does not fit.
+        InputError: A view has no photograph, or none of the photographs can be used.
     """
     if downscale < 1:
         raise InputError(f"downscale: expected a whole number of at least 1, got {downscale}")
@@ -84,16 +85,29 @@ def read_photographs(
         raise InputError(f"largest: expected a size in pixels, or 0 for none, got {largest}")
     report = progress or (lambda done, total, name: None)
     photographs: list[Photograph] = []
+    failed: list[InputError] = []
     hidden: list[str] = []
     store = PixelStore(device)
     report(0, len(views), "")
     for done, view in enumerate(views, start=1):
-        photograph = _read(view, _size(view.camera, downscale, largest), masks, store)
-        if photograph is None:
-            hidden.append(view.stem)
+        if view.image_path is None:
+            raise InputError(f"view {view.stem}: has no photograph; a scene is fitted to photographs")
+        try:
+            photograph = _read(view, _size(view.camera, downscale, largest), masks, store)
+        except InputError as error:
+            failed.append(error)
         else:
-            photographs.append(photograph)
+            if photograph is None:
+                hidden.append(view.stem)
+            else:
+                photographs.append(photograph)
         report(done, len(views), view.stem)
+    if failed and not photographs:
+        raise failed[0]
+    if failed:
+        logger.warning(
+            "left out %d of %d photographs that cannot be used, first: %s", len(failed), len(views), failed[0]
+        )
     if hidden:
         logger.warning("left out %d photographs whose mask leaves no pixel, first %s", len(hidden), hidden[0])
     scaled = [view.camera for view in views if largest and max(view.camera.size) // downscale > largest]
@@ -116,8 +130,7 @@ def _read(view: View, size: tuple[int, int], masks: Masks | None, store: PixelSt
     """One photograph at a size, or None if its mask leaves nothing of it."""
     import cv2
 
-    if view.image_path is None:
-        raise InputError(f"view {view.stem}: has no photograph; a scene is fitted to photographs")
+    assert view.image_path is not None
     mask = None if masks is None else masks(view)
     if mask is not None:
         mask = np.asarray(mask) != 0
@@ -143,26 +156,6 @@ def _read(view: View, size: tuple[int, int], masks: Masks | None, store: PixelSt
     if alpha is not None:
         opaque = torch.from_numpy(np.ascontiguousarray(alpha)).to(store.device, torch.float32) / 255.0
     return Photograph(view.stem, camera, store.put(pixels), known, opaque, Path(view.image_path))
-
-
-def masks_from_folder(folder: Path, views: Sequence[View]) -> Masks:
-    """Masks named like the views, {stem}.png; zero is left out, and a view without a mask counts as a whole.
-
-    Raises:
-        InputError: No view has a mask there.
-    """
-    paths = {view.stem: folder / f"{view.stem}.png" for view in views}
-    missing = [path.name for path in paths.values() if not path.is_file()]
-    if len(missing) == len(paths):
-        raise InputError(f"{folder}: holds no mask of any view; expected files such as {views[0].stem}.png")
-    if missing:
-        logger.warning("%s: %d of %d views have no mask (%s, ...)", folder, len(missing), len(paths), missing[0])
-
-    def mask(view: View) -> Any:
-        path = paths.get(view.stem)
-        return read_ids(path) if path is not None and path.is_file() else None
-
-    return mask
 
 
 def require_enough(views: Sequence[View] | Sequence[Photograph]) -> None:

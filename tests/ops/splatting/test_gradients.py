@@ -474,3 +474,28 @@ def test_huge_coefficients_stay_finite_colours(make_scene):
     sh[7], sh[9] = 3e38, -3e38
     spoiled = Gaussians(gaussians.means, gaussians.quats, gaussians.scales, gaussians.opacities, sh)
     assert not bool(torch.isnan(rasterize(spoiled, camera).features).any())
+
+
+def test_colors_and_features_in_one_pass():
+    """Harmonics and features together are what they are apart, and so are their gradients."""
+    rng = torch.Generator().manual_seed(0)
+    means = torch.rand(60, 3, generator=rng) * torch.tensor([3.0, 2.0, 3.0]) + torch.tensor([-1.5, -1.0, 2.0])
+    quats = torch.randn(60, 4, generator=rng)
+    scales = torch.rand(60, 3, generator=rng) * 0.3 + 0.02
+    fields = (means, quats, scales, torch.rand(60, generator=rng) * 0.9 + 0.05, torch.randn(60, 16, 3, generator=rng))
+    fields = (*fields, torch.rand(60, 5, generator=rng))
+    K = torch.tensor([[50.0, 0, 20], [0, 50.0, 15], [0, 0, 1]])
+    shape = (torch.eye(4), K, 40, 30)
+    leaves = [t.clone().requires_grad_() for t in fields]
+    both = rasterize_differentiable(*leaves[:4], *shape, sh=leaves[4], features=leaves[5]).features
+    apart = [t.clone().requires_grad_() for t in fields]
+    colors = rasterize_differentiable(*apart[:4], *shape, sh=apart[4]).features
+    others = rasterize_differentiable(*apart[:4], *shape, features=apart[5]).features
+    assert both.shape[2] == 8
+    torch.testing.assert_close(both, torch.cat([colors, others], dim=2), rtol=0, atol=2e-5)
+    weights = torch.rand(both.shape, generator=torch.Generator().manual_seed(1))
+    (both * weights).sum().backward()
+    ((colors * weights[..., :3]).sum() + (others * weights[..., 3:]).sum()).backward()
+    for name, one, two in zip(("means", "quats", "scales", "opacities", "sh", "features"), leaves, apart, strict=True):
+        scale = two.grad.abs().max().item()
+        torch.testing.assert_close(one.grad, two.grad, rtol=1e-3, atol=1e-4 * scale, msg=lambda m, n=name: f"{n}: {m}")

@@ -1,6 +1,7 @@
 """What a fit starts from: points on disk, random points, RGB-D; and the photographs it refuses."""
 
 import json
+import logging
 import shutil
 from dataclasses import replace
 from pathlib import Path
@@ -160,19 +161,29 @@ def test_fewer_than_three_photographs(boards):
         fit(boards.views[:2], load_points(boards.folder))
 
 
-def test_an_unreadable_photograph(copy):
-    (copy / "images" / "0003.png").write_bytes(b"\x89PNG\r\n\x1a\n" + b"\0" * 100)
-    with pytest.raises(InputError, match=r"0003\.png: image is cut short \(108 bytes\); copy or download it again"):
-        fit(load_views(copy), load_points(copy), settings=ONE_STEP)
-    (copy / "images" / "0003.png").write_text("a photograph")
-    with pytest.raises(InputError, match=r"0003\.png: is not an image that OpenCV can read"):
-        fit(load_views(copy), load_points(copy), settings=ONE_STEP)
+def test_photographs_that_cannot_be_used_are_left_out(copy, caplog):
+    views = load_views(copy)
+    data = (copy / "images" / "0003.png").read_bytes()
+    (copy / "images" / "0003.png").write_bytes(data[: len(data) // 2])
+    (copy / "images" / "0004.png").write_text("a photograph")
+    with caplog.at_level(logging.WARNING, logger="sgwarp"):
+        read = read_photographs(views)
+        assert [p.stem for p in read] == [view.stem for view in views if view.stem not in ("0003", "0004")]
+        assert "left out 2 of 8 photographs that cannot be used, first: " in caplog.text
+        assert "0003.png: image is cut short" in caplog.text
+        assert fit(load_views(copy), load_points(copy), settings=ONE_STEP).complete
+    assert "0004.png: is not an image that OpenCV can read" in caplog.text
+    for view in views:
+        view.image_path.write_text("nothing")
+    with pytest.raises(InputError, match=r"0000\.png: is not an image that OpenCV can read"):
+        read_photographs(views)
 
 
-def test_a_photograph_of_another_size(copy):
+def test_a_photograph_of_another_shape_is_left_out(copy, caplog):
     cv2.imwrite(str(copy / "images" / "0005.png"), np.zeros((30, 20, 3), np.uint8))
-    with pytest.raises(InputError, match=r"0005\.png: image is 20 x 30, its camera says 64 x 48; resize one of them"):
-        fit(load_views(copy), load_points(copy), settings=ONE_STEP)
+    with caplog.at_level(logging.WARNING, logger="sgwarp"):
+        assert "0005" not in [view.stem for view in load_views(copy)]
+    assert "0005.png: image is 20 x 30, its camera says 64 x 48" in caplog.text
 
 
 def test_a_photograph_that_shows_nothing_of_the_scene(copy):
@@ -204,7 +215,7 @@ def test_masks(boards, tmp_path):
     assert torch.equal(read[0].mask, torch.from_numpy(mask > 0))
     assert read[1].mask is None
     cv2.imwrite(str(tmp_path / "0000.png"), mask[:20])
-    with pytest.raises(InputError, match=r"view 0000: its mask has shape \[20, 64\], its photograph \[48, 64\]"):
+    with pytest.raises(InputError, match=r"0000\.png: is 64 x 20, its photograph 64 x 48; resize one of them"):
         read_photographs(views[:1], masks=masks)
     cv2.imwrite(str(tmp_path / "0000.png"), np.zeros_like(mask))
     with pytest.raises(InputError, match="view 0000: its mask leaves no pixel"):
@@ -255,7 +266,7 @@ def test_masks_count_on_held_out_views_too(boards):
 def test_masks_that_are_missing_are_counted(boards, tmp_path, caplog):
     cv2.imwrite(str(tmp_path / "0000.png"), np.full((48, 64), 255, np.uint8))
     masks_from_folder(tmp_path, boards.views)
-    assert "7 of 8 views have no mask (0001.png, ...)" in caplog.text
+    assert "7 of 8 views have no mask (0001, ...)" in caplog.text
 
 
 def test_a_mask_that_vanishes_with_the_size(boards):

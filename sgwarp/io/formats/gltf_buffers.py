@@ -1,0 +1,157 @@
+"""The container of a glTF file: JSON, buffers, buffer views and accessors (glTF 2.0, sections 3.6 and 4)."""
+
+from __future__ import annotations
+
+import base64
+import binascii
+import json
+import os
+import struct
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+from urllib.parse import unquote
+
+import numpy as np
+from numpy.typing import NDArray
+
+from sgwarp.errors import InputError
+from sgwarp.files.access import read_bytes
+
+MAGIC, JSON, BIN = b"glTF", 0x4E4F534A, 0x004E4942
+COMPONENTS = {5120: "i1", 5121: "u1", 5122: "<i2", 5123: "<u2", 5125: "<u4", 5126: "<f4"}
+WIDTHS = {"SCALAR": 1, "VEC2": 2, "VEC3": 3, "VEC4": 4}
+
+
+@dataclass(frozen=True)
+class Document:
+    """A glTF file.
+
+    Attributes:
+        path: The file.
+        meta: Its JSON.
+        buffers: The bytes of each buffer.
+    """
+
+    path: Path
+    meta: Mapping[str, Any]
+    buffers: list[memoryview]
+
+    def rows(self, key: str) -> list[Any]:
+        """A list of the JSON, empty if it is not there."""
+        rows = self.meta.get(key, [])
+        return rows if isinstance(rows, list) else []
+
+    def row(self, key: str, index: Any) -> Mapping[str, Any]:
+        """One object of such a list.
+
+        Raises:
+            InputError: There is none.
+        """
+        rows = self.rows(key)
+        if isinstance(index, bool) or not isinstance(index, int) or not 0 <= index < len(rows):
+            raise InputError(f"{self.path}: refers to {key}[{index}], which it does not hold; it is damaged")
+        if not isinstance(rows[index], dict):
+            raise InputError(f"{self.path}: {key}[{index}] is no object; it is damaged")
+        return dict(rows[index])
+
+    def view(self, index: Any) -> memoryview:
+        """The bytes of a buffer view.
+
+        Raises:
+            InputError: It does not lie within its buffer.
+        """
+        view = self.row("bufferViews", index)
+        buffer = view.get("buffer")
+        if not isinstance(buffer, int) or not 0 <= buffer < len(self.buffers):
+            raise InputError(f"{self.path}: bufferViews[{index}] refers to buffer {buffer}, which it does not hold")
+        data = self.buffers[buffer]
+        start, size = self._whole(view, "byteOffset", 0), self._whole(view, "byteLength", -1)
+        if size < 0 or start + size > len(data):
+            raise InputError(f"{self.path}: bufferViews[{index}] lies outside its buffer; it is cut short or damaged")
+        return data[start : start + size]
+
+    def accessor(self, index: Any, width: int, name: str) -> NDArray[np.float32]:
+        """The values of an accessor, float32 [N, width]; normalized integers become fractions.
+
+        Raises:
+            InputError: It has another width, is sparse, or does not lie within its buffer.
+        """
+        accessor = self.row("accessors", index)
+        kind = COMPONENTS.get(accessor.get("componentType", 0))
+        if kind is None or WIDTHS.get(str(accessor.get("type"))) != width or "sparse" in accessor:
+            raise InputError(f"{self.path}: attribute {name} must hold {width} numbers a row, not sparse")
+        data, dtype = self.view(accessor.get("bufferView")), np.dtype(kind)
+        count, start = self._whole(accessor, "count", -1), self._whole(accessor, "byteOffset", 0)
+        row = width * dtype.itemsize
+        stride = self._whole(self.row("bufferViews", accessor["bufferView"]), "byteStride", row)
+        if count < 1 or stride < row or start + (count - 1) * stride + row > len(data):
+            raise InputError(f"{self.path}: attribute {name} ({count} rows) lies outside its buffer; it is cut short")
+        rows: NDArray[Any] = np.ndarray((count, width), dtype, data, start, (stride, dtype.itemsize))
+        values = rows.astype(np.float32)
+        if accessor.get("normalized") is True and dtype.kind in "iu":
+            values = np.maximum(values / np.float32(np.iinfo(dtype).max), -1)
+        return values
+
+    def _whole(self, row: Mapping[str, Any], key: str, default: int) -> int:
+        value = row.get(key, default)
+        if isinstance(value, bool) or not isinstance(value, int) or not -1 <= value < 1 << 40:
+            raise InputError(f"{self.path}: '{key}' must be a whole number of bytes or rows, got {value!r}")
+        return value
+
+
+def read_document(path: str | os.PathLike[str]) -> Document:
+    """Read a .glb or .gltf with its buffers.
+
+    Raises:
+        InputError: A file is missing or damaged.
+    """
+    path, data = Path(path), read_bytes(path)
+    text, body = (data, None) if data[:4] != MAGIC else _chunks(path, data)
+    try:
+        meta = json.loads(text)
+    except (ValueError, RecursionError) as error:
+        raise InputError(f"{path}: its JSON is damaged ({str(error).splitlines()[0]})") from None
+    if not isinstance(meta, dict) or not isinstance(meta.get("asset"), dict):
+        raise InputError(f"{path}: is not a glTF file (no 'asset' in its JSON)")
+    buffers = []
+    listed = meta.get("buffers", [])
+    for index, buffer in enumerate(listed if isinstance(listed, list) else []):
+        uri = buffer.get("uri") if isinstance(buffer, dict) else None
+        if uri is None and index == 0 and body is not None:
+            buffers.append(body)
+        else:
+            buffers.append(memoryview(_read_buffer(path, uri)))
+    return Document(path, meta, buffers)
+
+
+def _chunks(path: Path, data: bytes) -> tuple[bytes, memoryview | None]:
+    """JSON and binary chunk of a .glb."""
+    if len(data) < 20 or struct.unpack_from("<I", data, 4)[0] != 2:
+        raise InputError(f"{path}: is not binary glTF of version 2, or is cut short")
+    chunks: dict[int, memoryview] = {}
+    position = 12
+    while position + 8 <= len(data):
+        size, kind = struct.unpack_from("<II", data, position)
+        if position + 8 + size > len(data):
+            raise InputError(f"{path}: is cut short: a chunk of {size} bytes does not fit; copy or download it again")
+        chunks.setdefault(kind, memoryview(data)[position + 8 : position + 8 + size])
+        position += 8 + size + -size % 4
+    if JSON not in chunks:
+        raise InputError(f"{path}: has no JSON chunk; it is damaged")
+    return bytes(chunks[JSON]), chunks.get(BIN)
+
+
+def _read_buffer(path: Path, uri: Any) -> bytes:
+    if not isinstance(uri, str):
+        raise InputError(f"{path}: a buffer has neither 'uri' nor the binary chunk of a .glb; it is damaged")
+    if uri.startswith("data:"):
+        try:
+            return base64.b64decode(uri.partition(",")[2], validate=True)
+        except binascii.Error as error:
+            raise InputError(f"{path}: a buffer's data are damaged ({error})") from None
+    name = Path(unquote(uri))
+    if name.is_absolute() or ".." in name.parts or "://" in uri:
+        raise InputError(f"{path}: its buffer {uri[:80]!r} lies outside its folder; only files beside it are read")
+    return read_bytes(path.parent / name)
