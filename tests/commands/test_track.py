@@ -61,7 +61,7 @@ def test_masks_and_tracks(files, tracked):
     seen = read_ids(tracked / "00002" / "1.png") == LABELS.index("ball") + 1
     assert ball["pixels"][2]["1"] == int(seen.sum())
     floor = tracks["objects"][str(LABELS.index("floor") + 1)]
-    assert np.abs(floor["centroid"]).max() < 0.2  # its middle is the origin
+    assert np.abs(floor["centroid"]).max() < 0.4  # its middle is the origin; it reaches to 2.2
     assert tracks["switches"][0] is None
     assert len(tracks["left_out"]) == FRAMES
 

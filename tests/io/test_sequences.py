@@ -112,7 +112,7 @@ def test_a_shape_that_the_archive_does_not_hold_takes_no_memory(tmp_path):
             if member == "means3D.npy":
                 data = data.replace(b"(4, 6, 3), }          ", b"(40000000000, 6, 3), }")
             target.writestr(member, data)
-    with pytest.raises(InputError, match="'means3D' of shape .* needs 2880000000128 bytes, the archive holds"):
+    with pytest.raises(InputError, match=r"'means3D' of shape .* needs 2880000000128 bytes, the archive holds"):
         load_sequence(huge)
 
 
