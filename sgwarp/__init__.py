@@ -9,13 +9,19 @@ from typing import TYPE_CHECKING, Any
 from sgwarp.version import __version__ as __version__
 
 if TYPE_CHECKING:
+    from sgwarp.apps.tracking.fusion import FusionSettings as FusionSettings
+    from sgwarp.apps.tracking.points import carry_points as carry_points
+    from sgwarp.apps.tracking.tracker import TrackSettings as TrackSettings
+    from sgwarp.apps.tracking.tracker import track as track
     from sgwarp.encoders.registry import make_encoder as make_encoder
     from sgwarp.encoders.registry import text_encoder_for as text_encoder_for
     from sgwarp.errors import InputError as InputError
+    from sgwarp.io.moving_views import load_moving_views as load_moving_views
     from sgwarp.io.openscene import load_openscene as load_openscene
     from sgwarp.io.points import load_points as load_points
     from sgwarp.io.scenes import load_gaussians as load_gaussians
     from sgwarp.io.scenes import save_gaussians as save_gaussians
+    from sgwarp.io.sequences import load_sequence as load_sequence
     from sgwarp.io.store import load_semantics as load_semantics
     from sgwarp.io.store import save_semantics as save_semantics
     from sgwarp.io.views import load_views as load_views
@@ -60,6 +66,7 @@ _HOME = {
     "DistillSettings": "sgwarp.network.training.settings",
     "FeatureMap": "sgwarp.scene",
     "FitSettings": "sgwarp.reconstruction.fitting.settings",
+    "FusionSettings": "sgwarp.apps.tracking.fusion",
     "Gaussians": "sgwarp.scene",
     "InputError": "sgwarp.errors",
     "RasterSettings": "sgwarp.ops.splatting.settings",
@@ -68,25 +75,29 @@ _HOME = {
     "SemanticNetwork": "sgwarp.network.semantic_network",
     "Semantics": "sgwarp.scene",
     "TextScores": "sgwarp.querying.scoring",
+    "TrackSettings": "sgwarp.apps.tracking.tracker",
     "TrainingScene": "sgwarp.network.training.data",
     "View": "sgwarp.scene",
     "best_texts": "sgwarp.querying.scoring",
+    "carry_points": "sgwarp.apps.tracking.points",
     "distill": "sgwarp.network.training.trainer",
     "evidence": "sgwarp.querying.scores",
     "fit": "sgwarp.reconstruction.fitting.trainer",
     "gaussians_from_depth": "sgwarp.reconstruction.depth",
     "lift": "sgwarp.lifting.lifter",
     "load_gaussians": "sgwarp.io.scenes",
+    "load_moving_views": "sgwarp.io.moving_views",
     "load_network": "sgwarp.network.semantic_network",
     "load_openscene": "sgwarp.io.openscene",
     "load_points": "sgwarp.io.points",
     "load_semantics": "sgwarp.io.store",
+    "load_sequence": "sgwarp.io.sequences",
     "load_views": "sgwarp.io.views",
     "localize": "sgwarp.querying.segmentation",
     "make_encoder": "sgwarp.encoders.registry",
     "orbit_views": "sgwarp.rendering.orbits",
-    "predict": "sgwarp.network.prediction",
     "plan": "sgwarp.rendering.renderer",
+    "predict": "sgwarp.network.prediction",
     "query": "sgwarp.querying.scores",
     "rasterize": "sgwarp.ops.splatting.autograd",
     "relevancy": "sgwarp.querying.scores",
@@ -101,6 +112,7 @@ _HOME = {
     "standardise": "sgwarp.querying.scores",
     "text_encoder_for": "sgwarp.encoders.registry",
     "top_contributors": "sgwarp.ops.splatting.contributors",
+    "track": "sgwarp.apps.tracking.tracker",
 }
 __all__ = [*_HOME, "__version__"]
 
