@@ -251,9 +251,9 @@ Before: one sum of 256 pixels per thread and column, 16 channels per block, feat
 a local frame of 1,024 bytes (backward, 16 channels), the same counting. Lifting 16 channels took {dense:.0f}.
 
 The backward pass of Taming 3DGS and Faster-GS, a lane per Gaussian that walks the 256 pixels of a tile, needs 287 steps
-of 32 fragments, so it would have to do with {limit:.0f} instructions a step to issue as few as the two-step sum here. A step
-replays a fragment at a pixel ({step:.0f} instructions here), adds nine sums and passes the pixel's state to the next lane, and
-no warp can skip; it also stores and reads 128 bytes per intersection. So it was not built.
+for 32 fragments: to issue as little as the two-step sum it would have {limit:.0f} instructions a step, for replaying a
+fragment at a pixel ({step:.0f} here), nine sums, and passing the pixel's state to the next lane. No warp could skip, and 128 bytes
+per intersection would be stored and read. It promises no lower count.
 
 ## Per thread
 
