@@ -223,11 +223,15 @@ def estimates(rows: list[dict[str, Any]]) -> list[tuple[str, float]]:
     adam = stage(0, 59 * 4 * 8 * count)
     lift = 16 * stage(cost["lift 32 channels"] * intersections, 132 * intersections + 128 * pixels)
     render = project + colors + lists
+    step = loss + replayed + adjoint + adam
     return [
         ("a rendering in colours", render + shown),
-        ("a training step (rendering, loss, gradients, Adam of all)", render + recorded + loss + replayed + adjoint + adam),
+        ("a training step (rendering, loss, gradients, Adam of all)", render + recorded + step),
         ("lifting 512 dense channels of one view", project + lists + lift),
-        ("lifting an id map with one id per tile", project + lists + stage(cost["lift ids, one id"] * intersections, 0)),
+        (
+            "lifting an id map with one id per tile",
+            project + lists + stage(cost["lift ids, one id"] * intersections, 0),
+        ),
     ]
 
 
@@ -250,10 +254,10 @@ Warp instructions: what eight warps issue for one fragment of a tile. One step i
 Before: one sum of 256 pixels per thread and column, 16 channels per block, features read from global memory through
 a local frame of 1,024 bytes (backward, 16 channels), the same counting. Lifting 16 channels took {dense:.0f}.
 
-The backward pass of Taming 3DGS and Faster-GS, a lane per Gaussian that walks the 256 pixels of a tile, needs 287 steps
-for 32 fragments: to issue as little as the two-step sum it would have {limit:.0f} instructions a step, for replaying a
-fragment at a pixel ({step:.0f} here), nine sums, and passing the pixel's state to the next lane. No warp could skip, and 128 bytes
-per intersection would be stored and read. It promises no lower count.
+The backward pass of Taming 3DGS and Faster-GS, a lane per Gaussian that walks the 256 pixels of a tile, needs 287
+steps for 32 fragments: to issue as little as the two-step sum it would have {limit:.0f} instructions a step, for
+replaying a fragment at a pixel ({step:.0f} here), nine sums, and passing the pixel's state to the next lane. No warp
+could skip, and 128 bytes per intersection would be stored and read. It promises no lower count.
 
 ## Per thread
 
@@ -266,9 +270,9 @@ Static machine instructions of the whole kernel, all branches and loops once.
 ## Roofline estimate
 
 **An estimate, not a measurement**: one million Gaussians with harmonics of degree 3, 3 million intersections,
-1920 x 1080, an H100 with 132 x 4 warp instructions per cycle at 1.755 GHz and 3.35 TB/s. For each stage the larger of the
-counts above at full issue and of the bytes that have to move; sorting and Adam by bytes alone. Latency, launches and
-the host are left out.
+1920 x 1080, an H100 with 132 x 4 warp instructions per cycle at 1.755 GHz and 3.35 TB/s. For each stage the larger of
+the counts above at full issue and of the bytes that have to move; sorting and Adam by bytes alone. Latency, launches
+and the host are left out.
 
 | | estimated floor [ms] |
 | --- | ---: |

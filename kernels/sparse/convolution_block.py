@@ -1,9 +1,10 @@
 """Sparse convolution, block schedule (CUDA): one launch for a layer, one for each of its gradients.
 
-An implicit product of matrices: a block owns 128 target voxels and 32 output channels, and for each offset of the kernel
-and 32 input channels stages the rows that its targets read, and the weights, in shared memory. A thread keeps 16 sums in
-registers, eight reads for 16 multiplications. Offsets without a pair in the block are skipped; nothing is written but
-the result, once, so that the order of the sums is fixed. The gradient of the weights sums pairs, offset by offset.
+An implicit product of matrices: a block owns 128 target voxels and 32 output channels, and for each offset of the
+kernel and 32 input channels stages the rows that its targets read, and the weights, in shared memory. A thread keeps 16
+sums in registers, eight reads for 16 multiplications. Offsets without a pair in the block are skipped; nothing is
+written but the result, once, so that the order of the sums is fixed. The gradient of the weights sums pairs, offset by
+offset.
 """
 
 import warp as wp

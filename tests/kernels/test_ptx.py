@@ -107,7 +107,9 @@ def test_no_kernel_uses_local_memory(ptx, tmp_path, record_property):
             if "Unsupported .version" in done.stderr:
                 pytest.skip(f"{ptxas} is older than the PTX that Warp writes")
             assert done.returncode == 0, done.stderr
-            numbers = r"(\d+) bytes stack frame, (\d+) bytes spill stores, (\d+) bytes spill loads.*?Used (\d+) registers"
+            numbers = (
+                r"(\d+) bytes stack frame, (\d+) bytes spill stores, (\d+) bytes spill loads.*?Used (\d+) registers"
+            )
             for found in re.findall(rf"entry function '(\w+)'.*?{numbers}", done.stderr, flags=re.DOTALL):
                 name, frame, stores, loads, registers = found
                 seen += 1

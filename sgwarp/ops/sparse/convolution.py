@@ -25,9 +25,7 @@ HALVES = (torch.float16, torch.bfloat16)
 BUSY_BLOCKS, MAX_SHARES = 1024, 16  # of a gradient of the weights: a large GPU has 132 multiprocessors
 
 
-def sparse_conv(
-    features: Tensor, weight: Tensor, kernel_map: KernelMap, *, schedule: str | None = None
-) -> Tensor:
+def sparse_conv(features: Tensor, weight: Tensor, kernel_map: KernelMap, *, schedule: str | None = None) -> Tensor:
     """y[target] = sum over the pairs of offset k of x[source] @ W[k]; differentiable in features and weight.
 
     In half precision, or under autocast, the products are taken in that precision and summed in float32; so is the
@@ -63,9 +61,7 @@ class _SparseConv(torch.autograd.Function):
     """Half precision features may come with a float32 weight, whose gradient then stays in float32."""
 
     @staticmethod
-    def forward(
-        ctx: Any, features: Tensor, weight: Tensor, kernel_map: KernelMap, schedule: str | None
-    ) -> Tensor:
+    def forward(ctx: Any, features: Tensor, weight: Tensor, kernel_map: KernelMap, schedule: str | None) -> Tensor:
         ctx.save_for_backward(features, weight)
         ctx.kernel_map, ctx.in_blocks = kernel_map, _fits_blocks(features.dtype, kernel_map, schedule)
         convolve = _convolve_in_blocks if ctx.in_blocks else _convolve
