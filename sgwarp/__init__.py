@@ -9,9 +9,13 @@ from typing import TYPE_CHECKING, Any
 from sgwarp.version import __version__ as __version__
 
 if TYPE_CHECKING:
+    from sgwarp.apps.instances.finder import instances as instances
+    from sgwarp.apps.instances.settings import InstanceSettings as InstanceSettings
     from sgwarp.encoders.registry import make_encoder as make_encoder
     from sgwarp.encoders.registry import text_encoder_for as text_encoder_for
     from sgwarp.errors import InputError as InputError
+    from sgwarp.io.instances import load_instances as load_instances
+    from sgwarp.io.instances import save_instances as save_instances
     from sgwarp.io.openscene import load_openscene as load_openscene
     from sgwarp.io.points import load_points as load_points
     from sgwarp.io.scenes import load_gaussians as load_gaussians
@@ -52,6 +56,8 @@ if TYPE_CHECKING:
     from sgwarp.scene import Camera as Camera
     from sgwarp.scene import FeatureMap as FeatureMap
     from sgwarp.scene import Gaussians as Gaussians
+    from sgwarp.scene import Instance as Instance
+    from sgwarp.scene import InstanceMap as InstanceMap
     from sgwarp.scene import Semantics as Semantics
     from sgwarp.scene import View as View
 
@@ -62,6 +68,9 @@ _HOME = {
     "FitSettings": "sgwarp.reconstruction.fitting.settings",
     "Gaussians": "sgwarp.scene",
     "InputError": "sgwarp.errors",
+    "Instance": "sgwarp.scene",
+    "InstanceMap": "sgwarp.scene",
+    "InstanceSettings": "sgwarp.apps.instances.settings",
     "RasterSettings": "sgwarp.ops.splatting.settings",
     "RenderPlan": "sgwarp.ops.splatting.plan",
     "RunLog": "sgwarp.runs.log",
@@ -75,8 +84,10 @@ _HOME = {
     "evidence": "sgwarp.querying.scores",
     "fit": "sgwarp.reconstruction.fitting.trainer",
     "gaussians_from_depth": "sgwarp.reconstruction.depth",
+    "instances": "sgwarp.apps.instances.finder",
     "lift": "sgwarp.lifting.lifter",
     "load_gaussians": "sgwarp.io.scenes",
+    "load_instances": "sgwarp.io.instances",
     "load_network": "sgwarp.network.semantic_network",
     "load_openscene": "sgwarp.io.openscene",
     "load_points": "sgwarp.io.points",
@@ -92,6 +103,7 @@ _HOME = {
     "relevancy": "sgwarp.querying.scores",
     "render": "sgwarp.rendering.renderer",
     "save_gaussians": "sgwarp.io.scenes",
+    "save_instances": "sgwarp.io.instances",
     "save_network": "sgwarp.network.semantic_network",
     "save_semantics": "sgwarp.io.store",
     "scenes_in": "sgwarp.network.training.data",

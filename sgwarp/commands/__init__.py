@@ -8,6 +8,7 @@ from sgwarp.commands.distill import Distill
 from sgwarp.commands.encoders import Encoders
 from sgwarp.commands.fit import Fit
 from sgwarp.commands.info import Info
+from sgwarp.commands.instances import Instances
 from sgwarp.commands.lift import Lift
 from sgwarp.commands.poses import Poses
 from sgwarp.commands.predict import Predict
@@ -26,6 +27,7 @@ COMMANDS = {
     "query": Query,
     "segment": Segment,
     "track": Track,
+    "instances": Instances,
     "render": Render,
     "info": Info,
     "encoders": Encoders,
