@@ -9,6 +9,11 @@ from typing import TYPE_CHECKING, Any
 from sgwarp.version import __version__ as __version__
 
 if TYPE_CHECKING:
+    from sgwarp.apps.editing.picker import EditContext as EditContext
+    from sgwarp.apps.editing.script import EditStep as EditStep
+    from sgwarp.apps.editing.selection import Selection as Selection
+    from sgwarp.apps.editing.session import EditSession as EditSession
+    from sgwarp.apps.editing.session import edit as edit
     from sgwarp.apps.instances.finder import instances as instances
     from sgwarp.apps.instances.settings import InstanceSettings as InstanceSettings
     from sgwarp.encoders.registry import make_encoder as make_encoder
@@ -64,6 +69,9 @@ if TYPE_CHECKING:
 _HOME = {
     "Camera": "sgwarp.scene",
     "DistillSettings": "sgwarp.network.training.settings",
+    "EditContext": "sgwarp.apps.editing.picker",
+    "EditSession": "sgwarp.apps.editing.session",
+    "EditStep": "sgwarp.apps.editing.script",
     "FeatureMap": "sgwarp.scene",
     "FitSettings": "sgwarp.reconstruction.fitting.settings",
     "Gaussians": "sgwarp.scene",
@@ -74,6 +82,7 @@ _HOME = {
     "RasterSettings": "sgwarp.ops.splatting.settings",
     "RenderPlan": "sgwarp.ops.splatting.plan",
     "RunLog": "sgwarp.runs.log",
+    "Selection": "sgwarp.apps.editing.selection",
     "SemanticNetwork": "sgwarp.network.semantic_network",
     "Semantics": "sgwarp.scene",
     "TextScores": "sgwarp.querying.scoring",
@@ -81,6 +90,7 @@ _HOME = {
     "View": "sgwarp.scene",
     "best_texts": "sgwarp.querying.scoring",
     "distill": "sgwarp.network.training.trainer",
+    "edit": "sgwarp.apps.editing.session",
     "evidence": "sgwarp.querying.scores",
     "fit": "sgwarp.reconstruction.fitting.trainer",
     "gaussians_from_depth": "sgwarp.reconstruction.depth",

@@ -5,6 +5,7 @@ Only `sgwarp.cli` imports this package, once tyro is known to be there; torch an
 
 from sgwarp.commands.demo import Demo
 from sgwarp.commands.distill import Distill
+from sgwarp.commands.edit import Edit
 from sgwarp.commands.encoders import Encoders
 from sgwarp.commands.fit import Fit
 from sgwarp.commands.info import Info
@@ -28,6 +29,7 @@ COMMANDS = {
     "segment": Segment,
     "track": Track,
     "instances": Instances,
+    "edit": Edit,
     "render": Render,
     "info": Info,
     "encoders": Encoders,

@@ -2,8 +2,8 @@
 
 With s_a(i) the share of a Gaussian's weight in its view that mask a claims, and w the weight in a view, two masks of
 views u and v share O = sum_i s_a(i) s_b(i) sqrt(w_u(i) w_v(i)). What a claims of all that v shows, V(a, v), is the same
-sum with s_b = 1. Masks are compared only by what both views show: IoU = O / (V(a, v) + V(b, u) - O), which occlusion and
-the borders of the images do not lower.
+sum with s_b = 1. Masks are compared only by what both views show: IoU = O / (V(a, v) + V(b, u) - O), which neither
+occlusion nor the borders of the images lower.
 
 Groups of masks are joined by average linkage: O and V of groups are sums over their pairs. In each round the pairs that
 are each other's best partner are joined, if no view has a mask in both.

@@ -207,9 +207,9 @@ def _facts(
     masks = np.bincount(of_mask[used], minlength=len(kept))
     # A view compares two instances if it has a mask of one and shows a twentieth of a mask of the other.
     reach = mass >= 0.05 * (own / np.maximum(masks, 1))[:, None]
-    compared: NDArray[np.bool_] = (shows[:, None] & reach[None]).any(axis=2)
+    compared = shows @ reach.T  # of booleans: whether some view does
     compared = compared | compared.T
-    together = (shows[:, None] & shows[None]).any(axis=2)
+    together = shows @ shows.T
     if names:
         called, sure = [names[group] for group in kept], [1.0] * len(kept)
     else:
