@@ -1,8 +1,9 @@
 """Which masks of different views show the same thing: the ones that claim the same Gaussians.
 
-With s_a(i) the share of a Gaussian's weight in its view that mask a claims, and w the weight in a view, two masks of
-views u and v share O = sum_i s_a(i) s_b(i) sqrt(w_u(i) w_v(i)). What a claims of all that v shows, V(a, v), is the same
-sum with s_b = 1. Masks are compared only by what both views show: IoU = O / (V(a, v) + V(b, u) - O), which neither
+With s_a(i) the share of a Gaussian's weight in its view that mask a claims, two masks of views u and v share
+O = sum_i s_a(i) s_b(i) sqrt(m_u(i) m_v(i)). The mass m = w^3 / (w^2 + p^2) of a Gaussian in a view is its weight w, and
+next to nothing where only a fraction of a pixel p shines through something else. What a claims of all that v shows,
+V(a, v), is the same sum with s_b = 1. Masks are compared only by what both views show: IoU = O / (V(a, v) + V(b, u) - O), which neither
 occlusion nor the borders of the images lower.
 
 Groups of masks are joined by average linkage: O and V of groups are sums over their pairs. In each round the pairs that
@@ -88,7 +89,7 @@ def build_graph(
         views: Evidence.
         level: Of the masks.
         count: Number N of Gaussians.
-        settings: `samples_per_mask`.
+        settings: `samples_per_mask` and `pixel_weight`.
         features: Of the Gaussians, [N, C], for the mean feature of each mask.
     """
     from scipy import sparse
@@ -102,12 +103,14 @@ def build_graph(
     totals: list[tuple[NDArray[Any], ...]] = []
     view_of: list[int] = []
     for number, view in enumerate(views):
-        total = np.sqrt(view.totals(count)[rows])
+        weight_of = view.totals(count)[rows]
+        total = np.sqrt(weight_of**3 / (weight_of**2 + settings.pixel_weight**2))
         masks = view.masks_of(level)
         owner, mask, weight = view.mask_pairs(masks)
         owner, kept = row_of[owner], row_of[owner] >= 0
         owner = owner[kept]
-        parts.append((owner, mask[kept] + len(view_of), weight[kept] / total[owner] * scale[owner]))
+        claim = weight[kept] / weight_of[owner] * total[owner]
+        parts.append((owner, mask[kept] + len(view_of), claim * scale[owner]))
         seen = np.flatnonzero(total)
         totals.append((seen, np.full(len(seen), number), total[seen] * scale[seen]))
         view_of += [number] * len(masks)
@@ -169,10 +172,10 @@ class _Groups:
     first: NDArray[np.int64]
     second: NDArray[np.int64]
     shared: NDArray[np.float64]
+    strongest: NDArray[np.float64]  # largest share of the smaller mask that two of their masks have in common
     likeness: NDArray[np.float64]
     visible: NDArray[np.float64]  # [K, views] sum of V over the masks
     counts: NDArray[np.int32]  # [K, views] masks in each view
-    mass: NDArray[np.float64]  # [K] sum of the masses of the masks
     features: NDArray[np.float64] | None
 
     @classmethod
@@ -182,8 +185,9 @@ class _Groups:
         counts = np.zeros(graph.visible.shape, np.int32)
         counts[masks, graph.view_of] = 1
         own = graph.visible[masks, graph.view_of]
+        share = graph.shared / np.minimum(own[graph.first], own[graph.second])
         old = np.full(len(graph.first), -1.0)
-        return cls(graph.first, graph.second, graph.shared, old, graph.visible, counts, own, graph.features)
+        return cls(graph.first, graph.second, graph.shared, share, old, graph.visible, counts, graph.features)
 
     def partners(self, settings: InstanceSettings) -> NDArray[np.int64]:
         """Pairs of groups that are each other's best partner, [P, 2]."""
@@ -208,9 +212,7 @@ class _Groups:
         both = np.einsum("ij,ij->i", self.visible[one], self.counts[other])
         both += np.einsum("ij,ij->i", self.visible[other], self.counts[one])
         iou = shared / np.maximum(both - shared, 1e-300)
-        size = self.counts.sum(axis=1)
-        smaller = np.minimum(self.mass[one] / size[one], self.mass[other] / size[other])
-        fine = (iou >= settings.least_iou) & (shared >= settings.least_shared * smaller)
+        fine = (iou >= settings.least_iou) & (self.strongest[pairs] >= settings.least_shared)
         fine &= ~((self.counts[one] > 0) & (self.counts[other] > 0)).any(axis=1)
         if self.features is not None and settings.least_cosine is not None:
             unit = self.features / np.maximum(np.linalg.norm(self.features, axis=1, keepdims=True), 1e-300)
@@ -225,14 +227,22 @@ class _Groups:
         first, second = np.minimum(first, second), np.maximum(first, second)
         keys, place = np.unique(first * count + second, return_inverse=True)
         shared = np.bincount(place, weights=self.shared, minlength=len(keys))
-        likeness = np.zeros(len(keys))
+        strongest, likeness = np.zeros(len(keys)), np.zeros(len(keys))
+        np.maximum.at(strongest, place, self.strongest)
         likeness[place] = self.likeness  # a pair of unchanged groups stands for itself alone
         first, second = keys // count, keys % count
         likeness[changed[first] | changed[second]] = -1.0
         apart = first != second
-        visible, counts, mass = (_sum_rows(part, joined, count) for part in (self.visible, self.counts, self.mass))
-        features = None if self.features is None else _sum_rows(self.features, joined, count)
-        return _Groups(first[apart], second[apart], shared[apart], likeness[apart], visible, counts, mass, features)
+        return _Groups(
+            first=first[apart],
+            second=second[apart],
+            shared=shared[apart],
+            strongest=strongest[apart],
+            likeness=likeness[apart],
+            visible=_sum_rows(self.visible, joined, count),
+            counts=_sum_rows(self.counts, joined, count),
+            features=None if self.features is None else _sum_rows(self.features, joined, count),
+        )
 
 
 def _sum_rows(values: NDArray[Any], joined: NDArray[np.int64], count: int) -> NDArray[Any]:

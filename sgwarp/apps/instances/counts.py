@@ -1,8 +1,9 @@
 """From groups of masks to Gaussians: how many views speak for each group, and what follows from it.
 
 A Gaussian's counts n_k are those of a Dirichlet posterior. Pixels of one view are no independent observations, so a
-view counts once at most: with w the Gaussian's weight in the view it adds w / (w + pixel_weight), divided among the
-groups as the weight is divided among their masks. What lies in no mask counts for "nothing", which is column 0.
+view counts once at most: with w the Gaussian's weight in the view and p `pixel_weight` it adds w^2 / (w^2 + p^2), divided
+among the groups as the weight is divided among their masks. The square keeps what shines through something else from
+being counted as seen. What lies in no mask counts for "nothing", which is column 0.
 """
 
 from __future__ import annotations
@@ -35,20 +36,21 @@ def count_groups(
     from scipy import sparse
 
     columns = 1 + int(groups.max(initial=-1)) + 1
-    total = sparse.csr_matrix((count, columns), dtype=np.float32)
+    counts = sparse.csr_matrix((count, columns), dtype=np.float32)
     parts: list[Any] = []
     first = 0
     for view in views:
         masks = view.masks_of(level)
         shares = set_shares(view, masks, groups[first : first + len(masks)], columns)
         first += len(masks)
-        scale = 1.0 / (view.totals(count) + pixel_weight)
+        total = view.totals(count)
+        scale = total / (total**2 + pixel_weight**2)
         value = (view.weights * scale[view.gaussians]).astype(np.float32)
         rows = sparse.csr_matrix((value, (view.gaussians, view.sets)), shape=(count, shares.shape[0]))
         parts.append(rows @ shares)
         if len(parts) == VIEWS_AT_ONCE:
-            total, parts = sum(parts, total), []
-    return sum(parts, total).tocsr()
+            counts, parts = sum(parts, counts), []
+    return sum(parts, counts).tocsr()
 
 
 def set_shares(view: ViewEvidence, masks: NDArray[np.int64], groups: NDArray[np.int64], columns: int) -> Any:

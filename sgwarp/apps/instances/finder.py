@@ -205,8 +205,8 @@ def _facts(
     own = np.zeros(len(kept))
     np.add.at(own, of_mask[used], visible[used, view_of[used]])
     masks = np.bincount(of_mask[used], minlength=len(kept))
-    # A view compares two instances if it has a mask of one and shows a twentieth of a mask of the other.
-    reach = mass >= 0.05 * (own / np.maximum(masks, 1))[:, None]
+    # A view compares two instances if it has a mask of one and shows a tenth of a mask of the other.
+    reach = mass >= 0.1 * own[:, None]
     compared = shows @ reach.T  # of booleans: whether some view does
     compared = compared | compared.T
     together = shows @ shows.T

@@ -21,11 +21,12 @@ class InstanceSettings:
             of a video tracker, or the part names of a detector.
         levels: Levels of the masks that are joined, each on its own, the finest first, of "default", "s", "m", "l".
         least_iou: Masks, or groups of them, are joined if they share this much of what both views show.
-        least_shared: And if what they share is at least this share of the smaller mask's mass.
+        least_shared: And if two of their masks share at least this much of the smaller one's mass.
         least_cosine: And if the mean features of their Gaussians agree this much; None asks no features.
         samples_per_mask: Gaussians of each mask that association looks at; 0 for all. The error of a share is at most
             1 / (2 sqrt(samples)).
-        pixel_weight: A view counts as half an observation of a Gaussian that it shows with this weight [pixels].
+        pixel_weight: A view counts as half an observation of a Gaussian that it shows with this weight [pixels]; much
+            less than it is as good as hidden.
         least_confidence: Below it a Gaussian is undecided.
         least_gaussians: Instances with fewer Gaussians are dropped.
         neighbors: Nearest neighbors that refine Gaussians at boundaries; 0 for no refinement.
@@ -39,7 +40,7 @@ class InstanceSettings:
     grouping: Grouping = "association"
     levels: tuple[str, ...] = ("default",)
     least_iou: float = 0.3
-    least_shared: float = 0.05
+    least_shared: float = 0.1
     least_cosine: float | None = None
     samples_per_mask: int = 512
     pixel_weight: float = 1.0
