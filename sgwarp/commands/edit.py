@@ -11,7 +11,7 @@ from sgwarp.commands.options import SceneOptions, check_name, find_views, load_o
 from sgwarp.errors import InputError
 
 if TYPE_CHECKING:
-    from sgwarp.apps.editing.picker import EditContext
+    from sgwarp.apps.editing.picker import EditContext, EditState
     from sgwarp.apps.editing.script import EditStep
     from sgwarp.runs.log import RunLog
     from sgwarp.scene import Gaussians
@@ -75,6 +75,9 @@ class Edit(SceneOptions):
     recolor: str | None = None
     """Color to give, shading kept: a name such as green, #rrggbb, or "r,g,b" from 0 to 1."""
 
+    plain: bool = False
+    """Write nothing but the columns of the reference implementation."""
+
     script: Path | None = None
     """Steps to replay, instead of --select and an operation."""
 
@@ -93,22 +96,34 @@ class Edit(SceneOptions):
         with self.logged(self.out.parent) as log:
             from sgwarp.apps.editing.script import load_script, save_script
             from sgwarp.apps.editing.session import edit
-            from sgwarp.io.scenes import save_gaussians
+            from sgwarp.io.columns import read_columns
 
             gaussians = self.load_scene(log)
             steps = self._steps() if self.script is None else self._replayed(load_script(self.script, gaussians))
             context = self._context(gaussians, log)
             with log.stage("edit"):
                 state = edit(gaussians, steps, context)
+            columns = {} if self.plain else read_columns(self.scene)
             with log.stage("write"):
                 script = self.out.with_name(f"{self.out.stem}.ops.json")
-                save_gaussians(state.gaussians.to("cpu"), self.out)
+                self._write(state, columns)
                 save_script(steps, gaussians, script)
             log.outputs += [str(self.out), str(script)]
             self._draw(gaussians, state.gaussians, log)
             changed = len(gaussians) - len(state.gaussians)
             print(f"{len(steps)} steps; {len(gaussians)} Gaussians before, {len(state.gaussians)} after")
             log.leave_out("gaussians_removed", max(changed, 0))
+
+    def _write(self, state: EditState, columns: dict[str, Any]) -> None:
+        """The new scene, with the columns of the old one where the format has room for them."""
+        from sgwarp.io.columns import write_with_columns
+        from sgwarp.io.scenes import save_gaussians
+
+        gaussians, rows = state.gaussians.to("cpu"), state.rows.cpu().numpy()
+        if columns and not self.out.name.endswith(".compressed.ply"):
+            write_with_columns(gaussians, self.out, {name: column[rows] for name, column in columns.items()})
+        else:
+            save_gaussians(gaussians, self.out)
 
     def _replayed(self, steps: tuple[EditStep, ...]) -> tuple[EditStep, ...]:
         if self.select or self._operations():

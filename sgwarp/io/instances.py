@@ -14,12 +14,14 @@ from dataclasses import asdict, fields
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import torch
 from torch import Tensor
 
 from sgwarp.errors import InputError
 from sgwarp.files.access import reading
 from sgwarp.files.atomic import atomic_path
+from sgwarp.io.columns import write_with_columns
 from sgwarp.scene import Gaussians, Instance, InstanceMap
 
 FORMAT = "sgwarp-instances"
@@ -132,7 +134,37 @@ def _read(path: str | os.PathLike[str]) -> tuple[dict[str, str], dict[str, Tenso
 
 
 def save_table(found: InstanceMap, path: str | os.PathLike[str]) -> None:
-    """Write the table of instances as JSON, {"levels": [...], "instances": [{...}, ...]}."""
-    content = {"levels": list(found.levels), "instances": [asdict(row) for row in found.table]}
+    """Write the table of instances as JSON, {"levels": [...], "labels": [...], "instances": [{...}, ...]}."""
+    content = {
+        "levels": list(found.levels),
+        "labels": label_names(found),
+        "instances": [asdict(row) for row in found.table],
+    }
     with atomic_path(path) as temporary:
         temporary.write_text(json.dumps(content, indent=1) + "\n", encoding="utf-8")
+
+
+def save_instance_scene(gaussians: Gaussians, found: InstanceMap, path: str | os.PathLike[str]) -> None:
+    """Write the scene as PLY with the columns instance, label and confidence of the coarsest level.
+
+    instance is int32, 0 for nothing and -1 for undecided; label is int32, the place of the instance's name among
+    `label_names`, -1 for none; confidence is float32.
+
+    Raises:
+        InputError: The instances belong to another scene, or the file cannot be written.
+    """
+    found.require_scene(gaussians)
+    ids = found.instance().cpu().numpy().astype(np.int32)
+    names = label_names(found)
+    place = np.array([-1, *(names.index(row.label) if row.label else -1 for row in found.table)], np.int32)
+    columns = {
+        "instance": ids,
+        "label": place[np.maximum(ids, 0)],
+        "confidence": found.confidence().cpu().numpy().astype(np.float32),
+    }
+    write_with_columns(gaussians, path, columns)
+
+
+def label_names(found: InstanceMap) -> list[str]:
+    """The different names of the instances, in the order of the alphabet."""
+    return sorted({row.label for row in found.table if row.label})

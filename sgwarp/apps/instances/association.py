@@ -3,8 +3,8 @@
 With s_a(i) the share of a Gaussian's weight in its view that mask a claims, two masks of views u and v share
 O = sum_i s_a(i) s_b(i) sqrt(m_u(i) m_v(i)). The mass m = w^3 / (w^2 + p^2) of a Gaussian in a view is its weight w, and
 next to nothing where only a fraction of a pixel p shines through something else. What a claims of all that v shows,
-V(a, v), is the same sum with s_b = 1. Masks are compared only by what both views show: IoU = O / (V(a, v) + V(b, u) - O), which neither
-occlusion nor the borders of the images lower.
+V(a, v), is the same sum with s_b = 1. Masks are compared only by what both views show, in
+IoU = O / (V(a, v) + V(b, u) - O), which neither occlusion nor the borders of the images lower.
 
 Groups of masks are joined by average linkage: O and V of groups are sums over their pairs. In each round the pairs that
 are each other's best partner are joined, if no view has a mask in both.

@@ -1,9 +1,9 @@
 """From groups of masks to Gaussians: how many views speak for each group, and what follows from it.
 
 A Gaussian's counts n_k are those of a Dirichlet posterior. Pixels of one view are no independent observations, so a
-view counts once at most: with w the Gaussian's weight in the view and p `pixel_weight` it adds w^2 / (w^2 + p^2), divided
-among the groups as the weight is divided among their masks. The square keeps what shines through something else from
-being counted as seen. What lies in no mask counts for "nothing", which is column 0.
+view counts once at most: with w the Gaussian's weight in the view and p `pixel_weight` it adds w^2 / (w^2 + p^2),
+divided among the groups as the weight is divided among their masks. The square keeps what shines through something else
+from being counted as seen. What lies in no mask counts for "nothing", which is column 0.
 """
 
 from __future__ import annotations
