@@ -31,7 +31,7 @@ SHORT = 32767
 
 
 def save_instances(found: InstanceMap, path: str | os.PathLike[str], notes: Mapping[str, Any] | None = None) -> None:
-    """Write instances; `load_instances` reads them back, shares and observations to a relative 2^-11.
+    """Write instances; `load_instances` reads them back exactly (those made elsewhere to a relative 2^-11).
 
     Args:
         found: What to write.

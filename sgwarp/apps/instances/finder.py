@@ -112,8 +112,8 @@ def join_evidence(
         raise InputError(f"no instance of {settings.least_gaussians} Gaussians or more; the masks agree in nothing")
     found = InstanceMap(
         candidates=torch.from_numpy(np.stack(candidates)),
-        shares=torch.from_numpy(np.stack([level.shares for level in levels])),
-        observations=torch.from_numpy(np.max([level.observations for level in levels], axis=0)),
+        shares=_as_stored(np.stack([level.shares for level in levels])),
+        observations=_as_stored(np.max([level.observations for level in levels], axis=0)),
         table=tuple(table),
         levels=settings.levels,
         fingerprint=gaussians.fingerprint,
@@ -231,6 +231,11 @@ def _called(
     best = [min(vote.items(), key=lambda item: (-item[1], item[0])) if vote else ("", 0) for vote in votes]
     shares = [hits / max(1, vote.total()) for (_, hits), vote in zip(best, votes, strict=True)]
     return [name for name, _ in best], shares
+
+
+def _as_stored(values: NDArray[np.float32]) -> torch.Tensor:
+    """Rounded as files hold them, so that a file says the same as what it was written from."""
+    return torch.from_numpy(values).half().float()
 
 
 def _blank(number: int, level: str) -> Instance:
