@@ -120,3 +120,20 @@ def test_fit_and_ask(run, capsys):
     assert {word: names[str(truth[y, x])] for word, (x, y) in found["hits"].items()} == {
         word: word for word in ("couch", "plant", "lamp")
     }
+
+
+def test_instances(run, capsys):
+    found, figures = run("04_instances.py")
+    assert figures == 3
+    assert "mean IoU over" in capsys.readouterr().out
+    assert found["mean_iou"] > 0.75
+    assert len(found["found"].table) >= 11
+
+
+def test_edit(run, capsys):
+    found, figures = run("05_edit.py")
+    assert figures == 3
+    assert "same bits as before: True" in capsys.readouterr().out
+    alone, together = found["figures"]["semantics alone"], found["figures"]["with instances"]
+    assert together.completeness > 0.85
+    assert together.leakage < 0.1 < alone.leakage + 1.0 - alone.completeness
