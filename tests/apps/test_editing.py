@@ -55,7 +55,8 @@ def test_two_turns_are_their_product():
 
 def test_harmonics_turn_as_in_splatreg():
     """An independent implementation, by recursion over the degrees."""
-    sh = pytest.importorskip("splatreg.sh")
+    from splatreg import sh
+
     turn = rotation_matrices(QUAT[None])[0]
     coefficients = torch.randn(5, 16, 3, dtype=torch.float64, generator=torch.Generator().manual_seed(1))
     torch.testing.assert_close(
