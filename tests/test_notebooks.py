@@ -132,3 +132,20 @@ def test_track(run, capsys):
     last = found["answers_fused"][-1].objects
     pixels = {one["name"]: sum(one["pixels"].values()) for one in last}
     assert pixels[found["on"]] > 10 * pixels[found["off"]]
+
+
+def test_instances(run, capsys):
+    found, figures = run("04_instances.py")
+    assert figures == 3
+    assert "mean IoU over" in capsys.readouterr().out
+    assert found["mean_iou"] > 0.75
+    assert len(found["found"].table) >= 11
+
+
+def test_edit(run, capsys):
+    found, figures = run("05_edit.py")
+    assert figures == 3
+    assert "same bits as before: True" in capsys.readouterr().out
+    alone, together = found["figures"]["semantics alone"], found["figures"]["with instances"]
+    assert together.completeness > 0.85
+    assert together.leakage < 0.1 < alone.leakage + 1.0 - alone.completeness
