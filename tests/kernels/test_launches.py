@@ -20,6 +20,8 @@ from sgwarp.reconstruction.fitting.initial import gaussians_from_points
 from sgwarp.reconstruction.fitting.mcmc import MarkovChain
 from sgwarp.reconstruction.fitting.model import Gradients, Model
 
+pytestmark = pytest.mark.slow
+
 README = Path(__file__).resolve().parents[2] / "kernels" / "README.md"
 COUNT, CHANNELS = 200, 20
 
