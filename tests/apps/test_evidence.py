@@ -5,6 +5,7 @@ import pytest
 import torch
 
 from sgwarp.apps.instances import counts as counting
+from sgwarp.apps.instances.agreement import agreement
 from sgwarp.apps.instances.association import (
     MaskGraph,
     build_graph,
@@ -13,7 +14,6 @@ from sgwarp.apps.instances.association import (
     priorities,
     sampling_rates,
 )
-from sgwarp.apps.instances.consistency import agreement
 from sgwarp.apps.instances.description import oriented_box, quaternion
 from sgwarp.apps.instances.evidence import ViewEvidence, view_evidence
 from sgwarp.apps.instances.settings import InstanceSettings
