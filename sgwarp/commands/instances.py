@@ -156,7 +156,7 @@ class Instances(SceneOptions):
         settings: InstanceSettings,
         log: RunLog,
     ) -> None:
-        from sgwarp.apps.instances.agreement import consistency
+        from sgwarp.apps.instances.view_agreement import consistency
 
         with log.stage("consistency"):
             before, after = consistency(gaussians, views, evidence, found, settings.raster)

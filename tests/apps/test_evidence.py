@@ -5,7 +5,6 @@ import pytest
 import torch
 
 from sgwarp.apps.instances import counts as counting
-from sgwarp.apps.instances.agreement import agreement
 from sgwarp.apps.instances.association import (
     MaskGraph,
     build_graph,
@@ -17,6 +16,7 @@ from sgwarp.apps.instances.association import (
 from sgwarp.apps.instances.description import oriented_box, quaternion
 from sgwarp.apps.instances.evidence import ViewEvidence, view_evidence
 from sgwarp.apps.instances.settings import InstanceSettings
+from sgwarp.apps.instances.view_agreement import agreement
 from sgwarp.encoders.masks.sources import ViewMasks
 from sgwarp.ops.reference import lifting as reference
 from sgwarp.ops.reference.rasterizer import rotation_matrices
