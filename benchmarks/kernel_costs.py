@@ -204,6 +204,107 @@ def measure(subject: Subject, arch: int, folder: Path) -> dict[str, Any]:
     return row
 
 
+def estimates(rows: list[dict[str, Any]]) -> list[tuple[str, float]]:
+    """Milliseconds on an H100 for 1M Gaussians at 1920 x 1080: the larger of issue and memory, stage by stage."""
+    cost = {row["kernel"]: row.get("warp_instructions", row.get("instructions", 0)) for row in rows}
+    count, intersections, pixels = 1e6, 3e6, 1920 * 1080
+
+    def stage(instructions: float, read_and_written: float) -> float:
+        return 1e3 * max(instructions / ISSUE, read_and_written / BANDWIDTH)
+
+    project = stage(cost["project"] * count / 32, 110 * count)
+    colors = stage(cost["harmonics"] * count / 32, (192 + 12 + 12) * count)
+    lists = stage(0, 24 * count * 4 + intersections * 8 * 10 + 64 * 2 * count)  # two sorts, four and two digits
+    shown = stage(cost["composite colours"] * intersections, 68 * intersections + 16 * pixels)
+    recorded = stage(cost["the same, recorded"] * intersections, 68 * intersections + 20 * pixels)
+    loss = stage(0, 4 * 3 * pixels * 13)  # three images, derivatives written and read, gradient
+    replayed = stage(cost["backward, colours"] * intersections, 132 * intersections + 28 * pixels)
+    adjoint = stage((cost["backward, project"] + cost["backward, harmonics"]) * count / 32, 650 * count)
+    adam = stage(0, 59 * 4 * 8 * count)
+    lift = 16 * stage(cost["lift 32 channels"] * intersections, 132 * intersections + 128 * pixels)
+    render = project + colors + lists
+    step = loss + replayed + adjoint + adam
+    return [
+        ("a rendering in colours", render + shown),
+        ("a training step (rendering, loss, gradients, Adam of all)", render + recorded + step),
+        ("lifting 512 dense channels of one view", project + lists + lift),
+        (
+            "lifting an id map with one id per tile",
+            project + lists + stage(cost["lift ids, one id"] * intersections, 0),
+        ),
+    ]
+
+
+PAGE = """# What the CUDA kernels cost, counted without a GPU
+
+**Nothing here is a GPU time.** The kernels were compiled for sm_{arch}; registers, stack and shared memory are what
+`ptxas` reports, instructions were counted in the machine code that `nvdisasm` lists. For a batch of fragments every
+branch counts as taken, so a count is an upper bound: a warp that a fragment does not reach skips most of its share.
+Occupancy is what registers and shared memory allow on a multiprocessor of an H100.
+`python -m benchmarks.kernel_costs` makes this page and `benchmarks/kernel_costs.json`.
+
+## Per intersection of a splat with a tile
+
+Warp instructions: what eight warps issue for one fragment of a tile. One step is one (fragment, pixel) of a thread.
+
+| kernel | registers | stack, spills | shared memory [bytes] | occupancy | warp instructions | before | of a step |
+| --- | ---: | ---: | ---: | ---: | ---: | ---: | ---: |
+{batches}
+
+Before: one sum of 256 pixels per thread and column, 16 channels per block, features read from global memory through
+a local frame of 1,024 bytes (backward, 16 channels), the same counting. Lifting 16 channels took {dense:.0f}.
+
+The backward pass of Taming 3DGS and Faster-GS, a lane per Gaussian that walks the 256 pixels of a tile, needs 287
+steps for 32 fragments: to issue as little as the two-step sum it would have {limit:.0f} instructions a step, for
+replaying a fragment at a pixel ({step:.0f} here), nine sums, and passing the pixel's state to the next lane. No warp
+could skip, and 128 bytes per intersection would be stored and read. It promises no lower count.
+
+## Per thread
+
+Static machine instructions of the whole kernel, all branches and loops once.
+
+| kernel | thread per | registers | shared memory [bytes] | occupancy | instructions |
+| --- | --- | ---: | ---: | ---: | ---: |
+{threads}
+
+## Roofline estimate
+
+**An estimate, not a measurement**: one million Gaussians with harmonics of degree 3, 3 million intersections,
+1920 x 1080, an H100 with 132 x 4 warp instructions per cycle at 1.755 GHz and 3.35 TB/s. For each stage the larger of
+the counts above at full issue and of the bytes that have to move; sorting and Adam by bytes alone. Latency, launches
+and the host are left out.
+
+| | estimated floor [ms] |
+| --- | ---: |
+{floors}
+"""
+
+
+def write_page(result: dict[str, Any]) -> str:
+    """The page in docs/."""
+    batches, threads, before = [], [], result["before"]
+    for row in result["kernels"]:
+        held = f"{row['registers']} |", f"{row['shared']:,} | {row['occupancy']:.1%} |"
+        if "warp_instructions" in row:
+            was = f"{before[row['kernel']]:,.0f}" if row["kernel"] in before else ""
+            step = row["steps"]["MUFU.EX2"]
+            spilled = f"{row['stack']}, {row['spills']} |"
+            count = f"{row['warp_instructions']:.0f} | {was} | {step:.1f} |"
+            batches.append(f"| {row['kernel']} | {held[0]} {spilled} {held[1]} {count}")
+        else:
+            threads.append(f"| {row['kernel']} | {row['per']} | {' '.join(held)} {row['instructions']:,} |")
+    replay = next(row for row in result["kernels"] if row["kernel"] == "backward, colours")
+    return PAGE.format(
+        arch=result["arch"],
+        batches="\n".join(batches),
+        threads="\n".join(threads),
+        dense=before.get("lift 16 channels", 0),
+        limit=replay["warp_instructions"] * 32 / 287,
+        step=replay["steps"]["MUFU.EX2"],
+        floors="\n".join(f"| {name} | {value:.1f} |" for name, value in estimates(result["kernels"])),
+    )
+
+
 def main() -> None:
     """Measure all kernels; write JSON and the page."""
     from sgwarp.ops import launcher  # noqa: F401 - starts Warp quietly
@@ -218,9 +319,10 @@ def main() -> None:
         with tempfile.TemporaryDirectory() as folder:
             rows.append(measure(subject, arguments.arch, Path(folder)))
         print(rows[-1], flush=True)
-    before = json.loads(arguments.out.read_text())["before"] if arguments.out.exists() else {}
-    result = {"arch": arguments.arch, "kernels": rows, "before": before}
+    kept = json.loads(arguments.out.read_text()) if arguments.out.exists() else {}
+    result = {"arch": arguments.arch, "kernels": rows, "before": kept.get("before", {})}
     arguments.out.write_text(json.dumps(result, indent=1) + "\n")
+    arguments.page.write_text(write_page(result))
 
 
 if __name__ == "__main__":

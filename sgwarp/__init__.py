@@ -9,13 +9,28 @@ from typing import TYPE_CHECKING, Any
 from sgwarp.version import __version__ as __version__
 
 if TYPE_CHECKING:
+    from sgwarp.apps.editing.picker import EditContext as EditContext
+    from sgwarp.apps.editing.script import EditStep as EditStep
+    from sgwarp.apps.editing.selection import Selection as Selection
+    from sgwarp.apps.editing.session import EditSession as EditSession
+    from sgwarp.apps.editing.session import edit as edit
+    from sgwarp.apps.instances.finder import instances as instances
+    from sgwarp.apps.instances.settings import InstanceSettings as InstanceSettings
+    from sgwarp.apps.tracking.fusion import FusionSettings as FusionSettings
+    from sgwarp.apps.tracking.points import carry_points as carry_points
+    from sgwarp.apps.tracking.tracker import TrackSettings as TrackSettings
+    from sgwarp.apps.tracking.tracker import track as track
     from sgwarp.encoders.registry import make_encoder as make_encoder
     from sgwarp.encoders.registry import text_encoder_for as text_encoder_for
     from sgwarp.errors import InputError as InputError
+    from sgwarp.io.instances import load_instances as load_instances
+    from sgwarp.io.instances import save_instances as save_instances
+    from sgwarp.io.moving_views import load_moving_views as load_moving_views
     from sgwarp.io.openscene import load_openscene as load_openscene
     from sgwarp.io.points import load_points as load_points
     from sgwarp.io.scenes import load_gaussians as load_gaussians
     from sgwarp.io.scenes import save_gaussians as save_gaussians
+    from sgwarp.io.sequences import load_sequence as load_sequence
     from sgwarp.io.store import load_semantics as load_semantics
     from sgwarp.io.store import save_semantics as save_semantics
     from sgwarp.io.views import load_views as load_views
@@ -52,46 +67,64 @@ if TYPE_CHECKING:
     from sgwarp.scene import Camera as Camera
     from sgwarp.scene import FeatureMap as FeatureMap
     from sgwarp.scene import Gaussians as Gaussians
+    from sgwarp.scene import Instance as Instance
+    from sgwarp.scene import InstanceMap as InstanceMap
     from sgwarp.scene import Semantics as Semantics
     from sgwarp.scene import View as View
 
 _HOME = {
     "Camera": "sgwarp.scene",
     "DistillSettings": "sgwarp.network.training.settings",
+    "EditContext": "sgwarp.apps.editing.picker",
+    "EditSession": "sgwarp.apps.editing.session",
+    "EditStep": "sgwarp.apps.editing.script",
     "FeatureMap": "sgwarp.scene",
     "FitSettings": "sgwarp.reconstruction.fitting.settings",
+    "FusionSettings": "sgwarp.apps.tracking.fusion",
     "Gaussians": "sgwarp.scene",
     "InputError": "sgwarp.errors",
+    "Instance": "sgwarp.scene",
+    "InstanceMap": "sgwarp.scene",
+    "InstanceSettings": "sgwarp.apps.instances.settings",
     "RasterSettings": "sgwarp.ops.splatting.settings",
     "RenderPlan": "sgwarp.ops.splatting.plan",
     "RunLog": "sgwarp.runs.log",
+    "Selection": "sgwarp.apps.editing.selection",
     "SemanticNetwork": "sgwarp.network.semantic_network",
     "Semantics": "sgwarp.scene",
     "TextScores": "sgwarp.querying.scoring",
+    "TrackSettings": "sgwarp.apps.tracking.tracker",
     "TrainingScene": "sgwarp.network.training.data",
     "View": "sgwarp.scene",
     "best_texts": "sgwarp.querying.scoring",
+    "carry_points": "sgwarp.apps.tracking.points",
     "distill": "sgwarp.network.training.trainer",
+    "edit": "sgwarp.apps.editing.session",
     "evidence": "sgwarp.querying.scores",
     "fit": "sgwarp.reconstruction.fitting.trainer",
     "gaussians_from_depth": "sgwarp.reconstruction.depth",
+    "instances": "sgwarp.apps.instances.finder",
     "lift": "sgwarp.lifting.lifter",
     "load_gaussians": "sgwarp.io.scenes",
+    "load_moving_views": "sgwarp.io.moving_views",
+    "load_instances": "sgwarp.io.instances",
     "load_network": "sgwarp.network.semantic_network",
     "load_openscene": "sgwarp.io.openscene",
     "load_points": "sgwarp.io.points",
     "load_semantics": "sgwarp.io.store",
+    "load_sequence": "sgwarp.io.sequences",
     "load_views": "sgwarp.io.views",
     "localize": "sgwarp.querying.segmentation",
     "make_encoder": "sgwarp.encoders.registry",
     "orbit_views": "sgwarp.rendering.orbits",
-    "predict": "sgwarp.network.prediction",
     "plan": "sgwarp.rendering.renderer",
+    "predict": "sgwarp.network.prediction",
     "query": "sgwarp.querying.scores",
     "rasterize": "sgwarp.ops.splatting.autograd",
     "relevancy": "sgwarp.querying.scores",
     "render": "sgwarp.rendering.renderer",
     "save_gaussians": "sgwarp.io.scenes",
+    "save_instances": "sgwarp.io.instances",
     "save_network": "sgwarp.network.semantic_network",
     "save_semantics": "sgwarp.io.store",
     "scenes_in": "sgwarp.network.training.data",
@@ -101,6 +134,7 @@ _HOME = {
     "standardise": "sgwarp.querying.scores",
     "text_encoder_for": "sgwarp.encoders.registry",
     "top_contributors": "sgwarp.ops.splatting.contributors",
+    "track": "sgwarp.apps.tracking.tracker",
 }
 __all__ = [*_HOME, "__version__"]
 

@@ -28,6 +28,7 @@ def _load(name: str, path: Path):
 
 catalogue = _load("sgwarp_test_scenes", Path(__file__).with_name("scenes.py"))
 differences = _load("sgwarp_test_differences", Path(__file__).with_name("differences.py"))
+devices = _load("sgwarp_test_devices", Path(__file__).with_name("devices.py"))
 _pretended = _load("sgwarp_test_pretended", Path(__file__).with_name("pretended.py"))
 _stage = _load("sgwarp_test_stage", Path(__file__).with_name("stage.py"))
 stage, toy_text, stage_files = _stage.stage, _stage.toy_text, _stage.stage_files
@@ -68,6 +69,27 @@ def pretended_cuda():
     """A CUDA device that is not there, for the length of the test (tests/pretended.py)."""
     with _pretended.pretended_cuda() as device:
         yield device
+
+
+def pytest_configure(config: pytest.Config) -> None:
+    config.addinivalue_line("markers", "cpu_only(why): stays on the CPU, whatever SGWARP_TEST_DEVICE says")
+    if devices.NAME != "cpu":
+        # The machine with the device may have another torch, whose warnings are no fault of what is tested.
+        config.addinivalue_line("filterwarnings", "default")
+
+
+@pytest.fixture(autouse=True)
+def operations_on_the_device(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
+    """Runs the operations that a test calls on SGWARP_TEST_DEVICE (tests/devices.py)."""
+    if devices.NAME == "cpu" or request.node.get_closest_marker("cpu_only"):
+        yield
+        return
+    devices.replace_operations(request.module, monkeypatch)
+    if devices.NAME != "pretended":
+        yield
+        return
+    with _pretended.pretended_cuda():
+        yield
 
 
 @contextmanager

@@ -12,7 +12,21 @@ import pytest
 import sgwarp
 
 HEAVY = ("torch", "warp", "cv2", "matplotlib", "transformers", "safetensors", "plyfile", "scipy")
-COMMANDS = ("lift", "query", "segment", "render", "info", "encoders", "demo", "fit", "distill", "predict", "report")
+COMMANDS = (
+    "lift",
+    "query",
+    "segment",
+    "render",
+    "info",
+    "encoders",
+    "demo",
+    "fit",
+    "distill",
+    "predict",
+    "report",
+    "instances",
+    "edit",
+)
 
 
 def heavy_modules_after(code: str) -> list[str]:

@@ -120,3 +120,32 @@ def test_fit_and_ask(run, capsys):
     assert {word: names[str(truth[y, x])] for word, (x, y) in found["hits"].items()} == {
         word: word for word in ("couch", "plant", "lamp")
     }
+
+
+def test_track(run, capsys):
+    found, figures = run("06_track.py")
+    assert figures == 5
+    assert "median trajectory error" in capsys.readouterr().out
+    alone, fused = (sum(found[name]) / found["FRAMES"] for name in ("alone", "fused"))
+    assert fused > alone + 0.05
+    assert found["figures"].median_error < 0.01
+    last = found["answers_fused"][-1].objects
+    pixels = {one["name"]: sum(one["pixels"].values()) for one in last}
+    assert pixels[found["on"]] > 10 * pixels[found["off"]]
+
+
+def test_instances(run, capsys):
+    found, figures = run("04_instances.py")
+    assert figures == 3
+    assert "mean IoU over" in capsys.readouterr().out
+    assert found["mean_iou"] > 0.75
+    assert len(found["found"].table) >= 11
+
+
+def test_edit(run, capsys):
+    found, figures = run("05_edit.py")
+    assert figures == 3
+    assert "same bits as before: True" in capsys.readouterr().out
+    alone, together = found["figures"]["semantics alone"], found["figures"]["with instances"]
+    assert together.completeness > 0.85
+    assert together.leakage < 0.1 < alone.leakage + 1.0 - alone.completeness

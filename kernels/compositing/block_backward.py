@@ -46,8 +46,9 @@ def make_composite_backward_block(wide: bool, depth: bool, absolute: bool, order
     valued = at_depth + int(depth) - MOMENTS  # colours, and the depth, at MOMENTS of a row
     planes_of_pixel = max(valued, 1)
     Row = wp.types.vector(length=columns_of_row, dtype=wp.float32)
+    bounds = None if wide else (BLOCK, BLOCKS)  # wide, 80 registers do for sm_90 and spill on sm_80
 
-    @wp.kernel(module="unique", module_options=BLOCK_OPTIONS, enable_backward=False, launch_bounds=(BLOCK, BLOCKS))
+    @wp.kernel(module="unique", module_options=BLOCK_OPTIONS, enable_backward=False, launch_bounds=bounds)
     def composite_backward_block(
         # In:
         offsets: wp.array[int],  # [tiles + 1]

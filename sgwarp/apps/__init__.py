@@ -1,1 +1,1 @@
-"""What can be done with a scene that has semantics."""
+"""Applications of lifted scenes: instances and parts, editing, tracking through time."""

@@ -6,9 +6,11 @@ Only `sgwarp.cli` imports this package, once tyro is known to be there; torch an
 from sgwarp.commands.convert import Convert
 from sgwarp.commands.demo import Demo
 from sgwarp.commands.distill import Distill
+from sgwarp.commands.edit import Edit
 from sgwarp.commands.encoders import Encoders
 from sgwarp.commands.fit import Fit
 from sgwarp.commands.info import Info
+from sgwarp.commands.instances import Instances
 from sgwarp.commands.lift import Lift
 from sgwarp.commands.poses import Poses
 from sgwarp.commands.predict import Predict
@@ -27,6 +29,8 @@ COMMANDS = {
     "query": Query,
     "segment": Segment,
     "track": Track,
+    "instances": Instances,
+    "edit": Edit,
     "render": Render,
     "info": Info,
     "convert": Convert,

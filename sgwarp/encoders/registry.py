@@ -10,9 +10,12 @@ import torch
 from sgwarp.encoders.base import MapSource, TextEncoder, require_same_space
 from sgwarp.encoders.building import Request, builder
 from sgwarp.encoders.building import make_text_encoder as make_text_encoder
+from sgwarp.encoders.catalogue import BY_NAME
+from sgwarp.encoders.compose import PaintedInstances
 from sgwarp.encoders.images.conse.class_space import SPACE as CONSE_SPACE
 from sgwarp.encoders.maps.files import LABEL_SPACE
-from sgwarp.encoders.names import Member, parse
+from sgwarp.encoders.masks.sources import DetectedMasks, GeneratedMasks, MappedMasks, MaskSource, NoText
+from sgwarp.encoders.names import Member, parse, parse_part
 from sgwarp.errors import InputError
 from sgwarp.scene import View
 
@@ -79,3 +82,41 @@ def text_encoder_for(
     encoder = make_text_encoder(name, device, templates)
     require_same_space(space, encoder.space, f"encoder {name}")
     return encoder
+
+
+def make_mask_source(name: str, views: Sequence[View] = (), device: Device = "cpu") -> MaskSource:
+    """The source of masks with a name.
+
+    Args:
+        name: A mask generator ("sam:PATH", "masks:DIR", "graph?scales=100,300,900"), id images ("files:DIR",
+            "deva:DIR"), or a detector ("vlpart:DIR", "gdino:PATH?classes=couch,lamp+sam:PATH").
+        views: The views that will be asked for; needed for files.
+        device: Where networks run.
+
+    Raises:
+        InputError: There is no source of that name, it gives no masks, or what it needs is missing.
+    """
+    request = _MaskRequest(name, device, views)
+    kind = BY_NAME.get(name.partition("?")[0].partition(":")[0])
+    if kind is not None and kind.role == "masks":
+        generator = request.masks(parse_part(name, name))
+        assert generator is not None
+        return GeneratedMasks(generator, needs_image=kind.name != "masks")
+    members = parse(name)
+    role = members[0].source.kind.role
+    if len(members) == 1 and role == "maps":
+        return MappedMasks(_make_member(members[0], request), name)
+    if len(members) == 1 and role == "instances":
+        source = _make_member(members[0], request)
+        assert isinstance(source, PaintedInstances)
+        needs_image = members[0].source.kind.name != "vlpart" or source.generator is not None
+        return DetectedMasks(source.detector, source.generator, name, needs_image)
+    makers = ", ".join(kind.name for kind in BY_NAME.values() if kind.role in ("masks", "maps", "instances"))
+    raise InputError(f"'{name}' gives no masks; take one of {makers} (see: sgwarp encoders)")
+
+
+class _MaskRequest(Request):
+    """Asks for masks and names alone: a detector needs no text side to embed them."""
+
+    def text(self, member: Member) -> TextEncoder:
+        return NoText()

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import logging
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
@@ -14,7 +13,7 @@ import torch
 from numpy.typing import NDArray
 
 from sgwarp.errors import InputError
-from sgwarp.files.access import read_bytes
+from sgwarp.files.documents import read_json
 from sgwarp.io.colmap_model import find_model, read_images
 from sgwarp.scene import View
 
@@ -117,7 +116,7 @@ def camera_places(data_set: Path) -> Array:
     """Places of all cameras that a data set lists, usable or not [world units], [N, 3]."""
     files = [data_set] if data_set.is_file() else [data_set / name for name in TRANSFORMS]
     if file := next((file for file in files if file.is_file()), None):
-        places = _places_in_transforms(json.loads(read_bytes(file)))
+        places = _places_in_transforms(read_json(file))
     elif model := find_model(data_set):
         places = _places_in_model(model)
     else:
@@ -133,7 +132,8 @@ def _by_file_name(places: Mapping[str, Array]) -> dict[str, Array]:
 
 def _places_in_transforms(meta: Mapping[str, Any]) -> dict[str, Array]:
     places: dict[str, Array] = {}
-    for frame in meta.get("frames", []):
+    frames = meta.get("frames") if isinstance(meta, Mapping) else None
+    for frame in frames if isinstance(frames, list) else []:
         try:
             pose = np.array(frame["transform_matrix"], dtype=np.float64)
             name = str(frame["file_path"])

@@ -291,3 +291,22 @@ def test_two_spaces_never_mix():
 def test_fields_that_do_not_fit(bad):
     with pytest.raises(InputError, match=r"masks|instances"):
         bad()
+
+
+@pytest.mark.parametrize("rule", [MaskedImages, RefinedPixels])
+def test_a_cached_map_depends_on_the_files_of_its_masks(view, rule):
+    class Filed(Shapes):
+        content = "one"
+
+        def identity_of(self, view):
+            return self.content
+
+    class Seeing(Toy):
+        identity = "toy"
+
+    generator = Filed()
+    source = rule(Seeing(), generator)
+    before = source.cache_key(view)
+    assert source.cache_key(view) == before
+    generator.content = "other"
+    assert source.cache_key(view) != before

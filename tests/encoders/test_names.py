@@ -1,6 +1,7 @@
 """Names of encoders, what is made of them, and what is said when they do not fit."""
 
 import importlib.util
+from types import SimpleNamespace
 
 import cv2
 import numpy as np
@@ -14,6 +15,7 @@ from sgwarp.encoders.catalogue import BY_NAME, KINDS
 from sgwarp.encoders.compose import Crops, MaskedImages, PaintedInstances, PlainPixels, RefinedPixels
 from sgwarp.encoders.ensemble import Ensemble
 from sgwarp.encoders.images.clip import JointEncoder
+from sgwarp.encoders.instances.detections import DetectorSettings
 from sgwarp.encoders.instances.vlpart import VLPartFiles
 from sgwarp.encoders.masks.files import FileMasks
 from sgwarp.encoders.masks.proposals import Proposals
@@ -169,3 +171,51 @@ def test_a_row_carries_its_builder(kind):
     assert callable(builder(kind.make))
     if kind.speak:
         assert callable(builder(kind.speak))
+
+
+@pytest.fixture
+def made(monkeypatch):
+    """`made(place, name)` builds the encoder of a name with the class at `place` replaced; how that was called."""
+
+    def build(place: str, name: str) -> SimpleNamespace:
+        calls = []
+
+        class Fake:
+            space, identity = "toy", "fake"
+
+            def __init__(self, *arguments, **options):
+                calls.append((arguments, options))
+
+            def encode_text(self, texts):
+                raise AssertionError("not asked")
+
+        monkeypatch.setattr(f"sgwarp.encoders.{place}", Fake)
+        source = make_encoder(name)
+        return SimpleNamespace(source=source, arguments=calls[0][0], **calls[0][1])
+
+    return build
+
+
+def test_options_reach_the_networks(made):
+    assert made("images.clip.JointEncoder", "clip:P?longest=448").longest == 448
+    assert not hasattr(made("images.clip.JointEncoder", "clip:P"), "longest")
+    call = made("pixels.lseg.LSeg", "lseg:P?longest=300&tokenizer=T")
+    assert (call.longest, call.tokenizer) == (300, "T")
+    call = made("maps.closed_set.ClosedSet", "mask2former:P?least=0.7&longest=320")
+    assert (call.arguments, call.least, call.longest) == (("P",), 0.7, 320)
+
+
+@pytest.mark.parametrize(
+    ("name", "place", "least"), [("owlv2", "owlv2.Owlv2", 0.1), ("gdino", "grounding_dino.GroundingDino", 0.25)]
+)
+def test_detectors_have_their_scores_and_masks(made, name, place, least):
+    def settings(call) -> DetectorSettings:
+        return call.settings if hasattr(call, "settings") else call.arguments[2]
+
+    plain = made(f"instances.{place}", f"{name}:P?classes=a,b+text:conse")
+    assert plain.arguments[:2] == ("P", ("a", "b"))
+    assert settings(plain) == DetectorSettings(least, 0.7)
+    assert plain.source.generator is None
+    changed = made(f"instances.{place}", f"{name}:P?classes=a&least_score=0.4&overlap=0.5+graph+text:conse")
+    assert settings(changed) == DetectorSettings(0.4, 0.5)
+    assert changed.source.generator.method == "graph"

@@ -1,4 +1,4 @@
-"""Every kernel that CUDA runs compiles to PTX without a GPU; with ptxas at hand, none of them spills registers."""
+"""Every kernel that CUDA runs compiles to PTX without a GPU; with ptxas at hand, none of them uses local memory."""
 
 import importlib
 import itertools
@@ -93,7 +93,7 @@ def find_ptxas() -> str | None:
     return shutil.which("ptxas")
 
 
-def test_no_kernel_spills_registers(ptx, tmp_path, record_property):
+def test_no_kernel_uses_local_memory(ptx, tmp_path, record_property):
     ptxas = find_ptxas()
     if ptxas is None:
         pytest.skip("no ptxas; pip install 'sgwarp[ptx]' brings one")
@@ -107,11 +107,13 @@ def test_no_kernel_spills_registers(ptx, tmp_path, record_property):
             if "Unsupported .version" in done.stderr:
                 pytest.skip(f"{ptxas} is older than the PTX that Warp writes")
             assert done.returncode == 0, done.stderr
-            pattern = (
-                r"entry function '(\w+)'.*?(\d+) bytes spill stores, (\d+) bytes spill loads.*?Used (\d+) registers"
+            numbers = (
+                r"(\d+) bytes stack frame, (\d+) bytes spill stores, (\d+) bytes spill loads.*?Used (\d+) registers"
             )
-            for name, stores, loads, registers in re.findall(pattern, done.stderr, flags=re.DOTALL):
+            for found in re.findall(rf"entry function '(\w+)'.*?{numbers}", done.stderr, flags=re.DOTALL):
+                name, frame, stores, loads, registers = found
                 seen += 1
                 record_property(f"sm_{arch} {name}", f"{registers} registers")
                 assert (stores, loads) == ("0", "0"), f"{name} spills on sm_{arch}"
+                assert frame == "0", f"{name} keeps {frame} bytes in local memory on sm_{arch}"
     assert seen >= len(ARCHITECTURES) * len({k.key + str(k.module.name) for k in cuda_kernels()})

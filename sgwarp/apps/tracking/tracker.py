@@ -108,13 +108,14 @@ class Tracker:
             self._lift.begin(gaussians)
         observe = getattr(self.source, "observe", None)
         if observe is not None:
-            observe(gaussians)
+            observe(frame.index, gaussians, views)
         for view in views:
             self._add(frame.index, view, gaussians)
         with self.log.stage("lift"):
             sums = self._lift.finish()
         work = replace(self._lift.work)
-        still = self._last is not None and not work.changed and not work.affected and not work.direct
+        still = self._last is not None and len(self._last.gaussians) == len(gaussians) and not work.direct
+        still = still and not work.changed and not work.affected
         with self.log.stage("fuse"):
             if self.fusion is None:
                 self.fusion = Fusion(self.settings.fusion, self.labels is not None)

@@ -15,15 +15,17 @@ from torch import Tensor
 from torch.autograd.function import once_differentiable
 
 from sgwarp.errors import InputError
+from sgwarp.kernels.sparse import convolution_block
 from sgwarp.kernels.sparse import convolution_lanes as kernels
-from sgwarp.ops.launcher import launch, scratch, view
+from sgwarp.ops.launcher import launch, launch_blocks, scratch, view
 from sgwarp.ops.sparse.voxels import KernelMap
 
 BLOCK_BYTES, LEAST_BLOCK = 2**17, 64  # rows of a block of targets: those that it reads should stay in the cache
 HALVES = (torch.float16, torch.bfloat16)
+BUSY_BLOCKS, MAX_SHARES = 1024, 16  # of a gradient of the weights: a large GPU has 132 multiprocessors
 
 
-def sparse_conv(features: Tensor, weight: Tensor, kernel_map: KernelMap) -> Tensor:
+def sparse_conv(features: Tensor, weight: Tensor, kernel_map: KernelMap, *, schedule: str | None = None) -> Tensor:
     """y[target] = sum over the pairs of offset k of x[source] @ W[k]; differentiable in features and weight.
 
     In half precision, or under autocast, the products are taken in that precision and summed in float32; so is the
@@ -33,6 +35,7 @@ def sparse_conv(features: Tensor, weight: Tensor, kernel_map: KernelMap) -> Tens
         features: x, floating point [N, C_in].
         weight: W, floating point [K^3, C_in, C_out].
         kernel_map: Pairs of sources among the N rows and targets among the M rows of the result.
+        schedule: "lanes" or "block", by default the device's own; either runs on the CPU.
 
     Returns:
         y, [M, C_out].
@@ -50,7 +53,7 @@ def sparse_conv(features: Tensor, weight: Tensor, kernel_map: KernelMap) -> Tens
     if torch.is_autocast_enabled(device) and features.dtype != torch.float64:
         features = features.to(torch.get_autocast_dtype(device))
     dtype = features.dtype
-    y: Tensor = _SparseConv.apply(features, weight.to(dtype) if dtype not in HALVES else weight, kernel_map)
+    y: Tensor = _SparseConv.apply(features, weight.to(dtype) if dtype not in HALVES else weight, kernel_map, schedule)
     return y
 
 
@@ -58,15 +61,16 @@ class _SparseConv(torch.autograd.Function):
     """Half precision features may come with a float32 weight, whose gradient then stays in float32."""
 
     @staticmethod
-    def forward(ctx: Any, features: Tensor, weight: Tensor, kernel_map: KernelMap) -> Tensor:
+    def forward(ctx: Any, features: Tensor, weight: Tensor, kernel_map: KernelMap, schedule: str | None) -> Tensor:
         ctx.save_for_backward(features, weight)
-        ctx.kernel_map = kernel_map
+        ctx.kernel_map, ctx.in_blocks = kernel_map, _fits_blocks(features.dtype, kernel_map, schedule)
+        convolve = _convolve_in_blocks if ctx.in_blocks else _convolve
         with torch.autocast(features.device.type, enabled=False):
-            return _convolve(features, weight.to(features.dtype), kernel_map)
+            return convolve(features, weight.to(features.dtype), kernel_map)
 
     @staticmethod
     @once_differentiable
-    def backward(ctx: Any, grad: Tensor) -> tuple[Tensor | None, Tensor | None, None]:
+    def backward(ctx: Any, grad: Tensor) -> tuple[Tensor | None, Tensor | None, None, None]:
         features, weight = ctx.saved_tensors
         for_features, for_weight = ctx.needs_input_grad[:2]
         v_features = v_weight = None
@@ -74,10 +78,48 @@ class _SparseConv(torch.autograd.Function):
             grad = grad.to(features.dtype).contiguous()
             if for_features:
                 turned = weight.to(features.dtype).transpose(1, 2)
-                v_features = _convolve(grad, turned, ctx.kernel_map.swapped())
+                convolve = _convolve_in_blocks if ctx.in_blocks else _convolve
+                v_features = convolve(grad, turned, ctx.kernel_map.swapped())
             if for_weight:
-                v_weight = _weight_gradient(features, grad, ctx.kernel_map).to(weight.dtype)
-        return v_features, v_weight, None
+                sum_pairs = _weight_gradient_in_blocks if ctx.in_blocks else _weight_gradient
+                v_weight = sum_pairs(features, grad, ctx.kernel_map).to(weight.dtype)
+        return v_features, v_weight, None, None
+
+
+def _fits_blocks(dtype: torch.dtype, kernel_map: KernelMap, schedule: str | None) -> bool:
+    """Whether the kernels of the block schedule take it: on CUDA, all but double precision and very large kernels."""
+    on_cuda = kernel_map.sources.is_cuda if schedule is None else schedule == "block"
+    return on_cuda and dtype != torch.float64 and kernel_map.offsets <= convolution_block.MAX_OFFSETS
+
+
+def _convolve_in_blocks(features: Tensor, weight: Tensor, kernel_map: KernelMap) -> Tensor:
+    """One launch. Half precision is rounded as it is given; products and sums are single precision."""
+    y = torch.empty(kernel_map.target_count, weight.shape[2], device=features.device)
+    table, identity = kernel_map.sources_of_targets, -1 if kernel_map.identity is None else kernel_map.identity
+    inputs = [view(t.to(torch.float32), wp.float32) for t in (features, weight)]
+    grid = [-(-len(y) // convolution_block.TARGETS), -(-y.shape[1] // convolution_block.CHANNELS)]
+    if y.numel():
+        inputs += [view(table, wp.int32), identity]
+        launch_blocks(convolution_block.convolve_blocks, grid, inputs, [view(y, wp.float32)], device=y.device)
+    return y.to(features.dtype)
+
+
+def _weight_gradient_in_blocks(features: Tensor, grad: Tensor, kernel_map: KernelMap) -> Tensor:
+    """One launch, and a sum where there are too few weights to keep a GPU busy; single precision."""
+    offsets, channels = kernel_map.offsets, convolution_block.CHANNELS
+    squares = -(-features.shape[1] // channels) * -(-grad.shape[1] // channels)
+    shares = max(1, min(BUSY_BLOCKS // (offsets * squares), MAX_SHARES))
+    v_weight = torch.zeros(shares, offsets, features.shape[1], grad.shape[1], device=features.device)
+    pairs = [view(t, wp.int64) for t in (kernel_map.sources, kernel_map.targets)]
+    inputs = [view(t.to(torch.float32), wp.float32) for t in (features, grad)]
+    inputs += [*pairs, view(kernel_map.starts_on_device, wp.int32)]
+    inputs.append(-1 if kernel_map.identity is None else kernel_map.identity)
+    grid = [shares, offsets, squares]
+    if v_weight.numel():
+        launch_blocks(
+            convolution_block.sum_weight_blocks, grid, inputs, [view(v_weight, wp.float32)], device=v_weight.device
+        )
+    return v_weight[0] if shares == 1 else v_weight.sum(dim=0)
 
 
 def _fits_kernel(features: Tensor, outputs: int) -> bool:

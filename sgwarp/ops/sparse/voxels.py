@@ -8,15 +8,15 @@ of a strided convolution are floor(c / stride) * stride in absolute coordinates.
 from __future__ import annotations
 
 import itertools
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import torch
 import warp as wp
 from torch import Tensor
 
 from sgwarp.errors import InputError
-from sgwarp.kernels.sparse import voxels
-from sgwarp.ops.launcher import launch, view
+from sgwarp.kernels.sparse import convolution_block, voxels
+from sgwarp.ops.launcher import launch, launch_plain, view
 
 AXIS_BITS, BIAS = int(voxels.AXIS_BITS), int(voxels.BIAS)
 LIMIT = int(voxels.LIMIT)  # coordinates lie in -LIMIT + 1 to LIMIT - 1
@@ -99,6 +99,8 @@ class KernelMap:
         starts: First pair of each of the K^3 offsets, and the number of pairs.
         source_count, target_count: Rows on either side.
         identity: Offset that connects every voxel with itself and has no pairs here; None if there is none.
+        turned: Whether it was swapped an odd number of times.
+        kept: Tables made of the pairs, shared with the swapped map.
     """
 
     sources: Tensor
@@ -107,6 +109,8 @@ class KernelMap:
     source_count: int
     target_count: int
     identity: int | None = None
+    turned: bool = False
+    kept: dict[str, Tensor] = field(default_factory=dict, repr=False)
 
     @property
     def offsets(self) -> int:
@@ -119,7 +123,39 @@ class KernelMap:
 
     def swapped(self) -> KernelMap:
         """The map of the transposed convolution: the same offsets, read and written the other way round."""
-        return KernelMap(self.targets, self.sources, self.starts, self.target_count, self.source_count, self.identity)
+        counts = self.target_count, self.source_count
+        return KernelMap(self.targets, self.sources, self.starts, *counts, self.identity, not self.turned, self.kept)
+
+    @property
+    def sources_of_targets(self) -> Tensor:
+        """Source of every target at each offset, -1 where it has none, int32 [K^3, M]; made once for both directions.
+
+        The identity has no pairs, so that its row is empty.
+        """
+        if "by target" not in self.kept:
+            self.kept.update(_tables(self))
+        return self.kept["by source" if self.turned else "by target"]
+
+    @property
+    def starts_on_device(self) -> Tensor:
+        """`starts` beside the pairs, int32 [K^3 + 1]."""
+        if "starts" not in self.kept:
+            self.kept["starts"] = torch.tensor(self.starts, dtype=torch.int32).to(self.sources.device)
+        return self.kept["starts"]
+
+
+def _tables(pairs: KernelMap) -> dict[str, Tensor]:
+    """Sources by target and targets by source of a map, named as they are before it is turned."""
+    device, offsets = pairs.sources.device, pairs.offsets
+    filled = torch.full((offsets * (pairs.target_count + pairs.source_count),), -1, dtype=torch.int32, device=device)
+    by_target, by_source = filled.split([offsets * pairs.target_count, offsets * pairs.source_count])
+    by_target, by_source = by_target.view(offsets, -1), by_source.view(offsets, -1)
+    starts = torch.tensor(pairs.starts, dtype=torch.int32).to(device)
+    inputs = [view(pairs.sources, wp.int64), view(pairs.targets, wp.int64), view(starts, wp.int32)]
+    outputs = [view(by_target, wp.int32), view(by_source, wp.int32)]
+    launch_plain(convolution_block.tabulate_pairs, len(pairs.sources), inputs, outputs, device=device)
+    tables = (by_source, by_target) if pairs.turned else (by_target, by_source)
+    return {"by target": tables[0], "by source": tables[1], "starts": starts}
 
 
 def kernel_map(sources: Tensor, targets: Tensor, side: int, step: int = 1) -> KernelMap:

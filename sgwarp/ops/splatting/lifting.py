@@ -17,10 +17,11 @@ from sgwarp.errors import InputError
 from sgwarp.kernels.lifting import block as lifting_block
 from sgwarp.kernels.lifting import lanes as lifting_lanes
 from sgwarp.kernels.lifting import shared as lifting
-from sgwarp.kernels.transmittance import LaneIds, Lanes
+from sgwarp.kernels.transmittance import Lanes
 from sgwarp.ops.launcher import launch, launch_blocks, launch_plain, scratch, view
 from sgwarp.ops.splatting import tiles
 from sgwarp.ops.splatting.forward import LANE, TILE_ROWS, composite, in_slices, lane_scratch
+from sgwarp.ops.splatting.id_weights import localize_ids, weigh_ids
 from sgwarp.ops.splatting.settings import RasterSettings
 from sgwarp.scene import Camera, FeatureMap, Gaussians
 
@@ -268,18 +269,8 @@ def _add_ids(
     ordered: bool,
 ) -> None:
     device = sums.weight.device
-    height, width = camera.size
-    count, visible = lists.tile_count, len(lists.order)
-    tile_ids = scratch("tile ids", count * 256, torch.int32, device).view(count, 256)
-    id_counts = scratch("tile id counts", count, torch.int32, device)
-    local_ids = scratch("local ids", count * 256, torch.int32, device).view(count, TILE_ROWS, LANE)
-    uniform = scratch("uniform rows", count * TILE_ROWS, torch.int32, device).view(count, TILE_ROWS)
-    outputs = [view(tile_ids, wp.int32), view(id_counts, wp.int32), view(local_ids, LaneIds), view(uniform, wp.int32)]
-    every_tile = view(torch.empty(0, dtype=torch.int32, device=device), wp.int32)
-    inputs = [every_tile, view(ids, wp.int32), width, height]
-    launch(lifting.localize_ids, count, inputs, outputs, device=device)
-    row_starts = torch.zeros(count + 1, dtype=torch.int32, device=device)
-    row_starts[1:] = ((lists.offsets[1:] - lists.offsets[:-1]) * id_counts).cumsum(0)
+    visible = len(lists.order)
+    local = localize_ids(lists, camera, ids)
 
     # One-hot labels: the weights of the ids are the features, so they are added where they belong at once.
     one_hot = feature_map.vectors is None
@@ -290,29 +281,13 @@ def _add_ids(
     else:
         rows = len(sums.weight) if atomic else visible
         id_weights = scratch("id weights", rows * known, torch.float32, device).view(rows, known).zero_()
-    knobs = tiles.knobs(settings)
-    common = lists.arrays()
-    row_places = view(row_starts, wp.int32)
-    if atomic:
-        view_weights = torch.zeros_like(sums.weight)
-        weights, starts = torch.empty(0, device=device), torch.empty(0, dtype=torch.int32, device=device)
-    else:
-        view_weights = torch.empty(0, device=device)
-        weights = scratch("id entry weights", int(row_starts[-1]), torch.float32, device).zero_()
-        starts = scratch("id entry starts", lists.intersections, torch.int32, device)
-    if block:
-        labels = [view(t, wp.int32) for t in (local_ids, uniform, tile_ids, id_counts)]
-        outputs = [*(view(t, wp.float32) for t in (id_weights, view_weights, weights)), view(starts, wp.int32)]
-        kernel = lifting_block.make_lift_ids_block(ordered)
-        launch_blocks(kernel, [count], [*common, *labels, row_places, knobs, width, height], outputs, device=device)
-    else:
-        state = lane_scratch("state", TILE_ROWS, 1, device)
-        labels = [view(local_ids, LaneIds), view(uniform, wp.int32)]
-        inputs = [every_tile, *common, *labels, row_places, knobs, width, height, state]
-        outputs = [view(weights, wp.float32), view(starts, wp.int32)]
-        launch(lifting_lanes.lift_ids, count, inputs, outputs, device=device, slots=True)
     vectors = None if feature_map.vectors is None else in_slices(feature_map.vectors.to(device))
     if atomic:
+        view_weights = torch.zeros_like(sums.weight)
+        unused = [torch.empty(0, device=device), torch.empty(0, dtype=torch.int32, device=device)]
+        inputs = [*lists.arrays(), *local.block_arrays(), tiles.knobs(settings), camera.width, camera.height]
+        outputs = [view(t, wp.float32) for t in (id_weights, view_weights, unused[0])] + [view(unused[1], wp.int32)]
+        launch_blocks(lifting_block.make_lift_ids_block(False), [lists.tile_count], inputs, outputs, device=device)
         _fold(view_weights, sums)
         if vectors is not None:
             inputs = [view(t, wp.float32) for t in (id_weights, vectors.flatten(1))]
@@ -320,10 +295,9 @@ def _add_ids(
             launch_plain(lifting_block.add_id_channels, 32 * len(sums.weight), inputs, outputs, device=device)
         return
     order = view(lists.order, wp.int32)
-    where = [view(t, wp.int32) for t in (lists.entries, lists.places, starts, lists.tiles)]
-    names = [view(tile_ids, wp.int32), view(id_counts, wp.int32), view(weights, wp.float32)]
+    where = weigh_ids(lists, camera, local, settings, block=block)
     outputs = [view(t, wp.float32) for t in (id_weights, sums.weight, sums.weight_squared)]
-    launch(lifting.sum_id_weights, visible, [order, *where, *names, int(one_hot)], outputs, device=device)
+    launch(lifting.sum_id_weights, visible, [order, *where, int(one_hot)], outputs, device=device)
     if vectors is not None:
         inputs = [order, view(id_weights, wp.float32), view(vectors, Lanes)]
         launch(lifting.add_id_features, visible, inputs, [view(sums.slices, Lanes)], device=device)

@@ -25,7 +25,7 @@ class Frame:
     Attributes:
         origin: In world coordinates, float64 [3].
         scale: One unit of the frame [world units].
-        near: Near plane of cameras that have the default one [units of the frame], or None to keep it.
+        near: Largest near plane, and that of cameras with the default one [units of the frame]; None to keep theirs.
     """
 
     origin: Tensor
@@ -47,8 +47,9 @@ class Frame:
         """A camera from the world."""
         pose = camera.world_to_camera.clone()
         pose[:3, 3] = (pose[:3, :3] @ self.origin + pose[:3, 3]) / self.scale
-        chosen = self.near is None or camera.near != Camera.near
-        near = camera.near / self.scale if chosen or self.near is None else self.near
+        near = camera.near / self.scale
+        if self.near is not None:
+            near = self.near if camera.near == Camera.near else min(near, self.near)
         return replace(camera, world_to_camera=pose, near=near, far=camera.far / min(self.scale, 1.0))
 
     def points(self, positions: Any) -> Tensor:

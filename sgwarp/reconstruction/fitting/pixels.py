@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import tempfile
+import weakref
 from typing import Any
 
 import numpy as np
@@ -30,7 +31,8 @@ class PixelStore:
             self.left -= pixels.nbytes
             return torch.from_numpy(np.ascontiguousarray(pixels)).to(self.device)
         if self.file is None:
-            self.file = tempfile.TemporaryFile(prefix="sgwarp-")  # noqa: SIM115 (it is open as long as the photographs)
+            self.file = tempfile.TemporaryFile(prefix="sgwarp-")  # noqa: SIM115 (open as long as the photographs are)
+            weakref.finalize(self, self.file.close)
         place = self.file.seek(0, os.SEEK_END)
         self.file.write(np.ascontiguousarray(pixels).tobytes())
         return StoredPixels(self, place, pixels.shape)

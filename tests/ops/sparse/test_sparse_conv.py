@@ -82,6 +82,34 @@ def test_single_precision_is_the_dense_one(side, step, stride, channels):
     assert_near(sparse_conv(*narrow, kernel_map(sources, targets, side, step)), theirs, narrow, wide)
 
 
+@pytest.mark.parametrize("channels", [(10, 70), (48, 3)])
+@pytest.mark.parametrize(("side", "step", "stride"), [(3, 1, 1), (2, 1, 2)])
+def test_blocks_convolve_as_the_dense_one(side, step, stride, channels):
+    """The kernels of CUDA: more rows and channels than a block owns, and fewer."""
+    sources = keys_of(300, 6)
+    targets = sources if stride == 1 else coarsen(sources, stride)
+    pairs = kernel_map(sources, targets, side, step)
+    wide = inputs(len(sources), side, channels)
+    narrow = [t.detach().float().requires_grad_() for t in wide]
+    both = unpack_voxels(sources), unpack_voxels(targets)
+    theirs = reference_sparse.convolve(*wide, *both, side, step)
+    assert_near(sparse_conv(*narrow, pairs, schedule="block"), theirs, narrow, wide)
+    if stride == 2:  # back up on the same map, whose tables are kept
+        down = torch.randn(len(targets), channels[0], generator=torch.Generator().manual_seed(1)).requires_grad_()
+        up = [sparse_conv(down, narrow[1], pairs.swapped(), schedule=schedule) for schedule in ("block", "lanes")]
+        assert largest_difference(*up) < 2e-6
+        assert largest_difference(*(torch.autograd.grad(y.square().sum(), down)[0] for y in up)) < 1e-5
+
+
+def test_blocks_leave_double_precision_and_large_kernels_to_torch():
+    keys = keys_of(50, 5)
+    features, weight = inputs(len(keys), 3)
+    assert torch.equal(
+        sparse_conv(features, weight, kernel_map(keys, keys, 3), schedule="block"),
+        sparse_conv(features, weight, kernel_map(keys, keys, 3), schedule="lanes"),
+    )
+
+
 def test_single_precision_has_the_same_bits_for_any_number_of_threads():
     keys = keys_of(4000, 12)
     pairs = kernel_map(keys, keys, 3)

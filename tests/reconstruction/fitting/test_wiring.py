@@ -22,6 +22,7 @@ from sgwarp.scene import Camera, Gaussians
 CAMERA = Camera(torch.tensor([[40.0, 0, 20], [0, 40, 20], [0, 0, 1]]), torch.eye(4), 40, 40)
 SHORT = FitSettings(steps=12, cap=1300, refine_every=4, degree_every=6, evaluate_every=4, sh_degree=1)
 CPU = torch.device("cpu")
+PHOTOGRAPHS = 1000  # so many that nothing goes unseen for long
 
 
 def cloud(count: int, opacity: float = 0.5) -> Model:
@@ -98,7 +99,7 @@ def test_faint_gaussians_move_at_random():
     def moved(extent: float, noise: float, step: int) -> torch.Tensor:
         model = cloud(20, 0.006)
         before = model["means"].clone()
-        after(MarkovChain(replace(settings, noise=noise), extent), model, step)
+        after(MarkovChain(replace(settings, noise=noise), extent, PHOTOGRAPHS), model, step)
         return model["means"] - before
 
     assert not moved(1.0, 0.0, 50).any()
@@ -116,9 +117,13 @@ def test_hosts_and_their_copies_shrink_to_keep_the_picture(event):
     model = cloud(20, 0.5)
     if event == "relocate":
         model.groups["opacities"].values[0] = 0.004
+    for group in model.groups.values():
+        group.first.fill_(0.1)
+        group.second.fill_(0.1)
+    model.steps.fill_(7)
     before = model.gaussians()
     cap = 20 if event == "relocate" else 21
-    after(MarkovChain(FitSettings(strategy="mcmc", steps=30_000, cap=cap, noise=0.0), 1.0), model, 600)
+    after(MarkovChain(FitSettings(strategy="mcmc", steps=30_000, cap=cap, noise=0.0), 1.0, PHOTOGRAPHS), model, 600)
     assert len(model) == cap
     copy = 0 if event == "relocate" else 20
     (host,) = [row for row in range(20) if row != copy and torch.equal(model["means"][row], model["means"][copy])]
@@ -131,8 +136,29 @@ def test_hosts_and_their_copies_shrink_to_keep_the_picture(event):
     torch.testing.assert_close(model["scales"][copy], model["scales"][host])
     rest = [row for row in range(1, 20) if row != host]
     torch.testing.assert_close(model["scales"][rest], before.scales[rest], rtol=1e-6, atol=0)
-    assert not model.groups["scales"].first[[host, copy]].any()
+    for group in model.groups.values():
+        assert not group.first[[host, copy]].any()
+        assert not group.second[[host, copy]].any()
+        assert group.first[rest].any()
     assert not model.steps[[host, copy]].any()
+    assert (model.steps[rest] == 7).all()
+
+
+@pytest.mark.parametrize(("opacity", "moves"), [(0.0049, True), (0.0051, False)])
+def test_what_is_dead_moves(opacity, moves):
+    model = cloud(20, 0.5)
+    model.groups["opacities"].values[3] = opacity
+    before = model["means"].clone()
+    settings = FitSettings(strategy="mcmc", steps=30_000, cap=20, noise=0.0)
+    after(MarkovChain(settings, 1.0, PHOTOGRAPHS), model, 600)
+    assert bool((model["means"][3] != before[3]).any()) == moves
+
+
+@pytest.mark.parametrize(("step", "grows"), [(500, False), (600, True), (24_900, True), (25_000, False)])
+def test_the_chain_refines_at_its_times(step, grows):
+    model = cloud(20)
+    after(MarkovChain(FitSettings(strategy="mcmc", steps=30_000, cap=21), 1.0, PHOTOGRAPHS), model, step)
+    assert (len(model) > 20) == grows
 
 
 # Adaptive density control.
@@ -143,10 +169,35 @@ def test_opacities_are_reset_at_their_times(step, resets):
     model = cloud(4, 0.9)
     for moment in ("first", "second"):
         getattr(model.groups["opacities"], moment).fill_(0.5)
-    after(Densify(FitSettings(strategy="default", steps=30_000), 1.0, 4, CPU), model, step)
+    after(Densify(FitSettings(strategy="default", steps=30_000), 1.0, PHOTOGRAPHS, 4, CPU), model, step)
     torch.testing.assert_close(model["opacities"], torch.full((4,), FAINT if resets else 0.9))
     for moment in ("first", "second"):
         assert getattr(model.groups["opacities"], moment).any() != resets
+
+
+def test_resets_of_short_runs_leave_time_to_recover():
+    """A tenth of the reference's steps, but no reset before 1,000 of them."""
+    settings = FitSettings(strategy="default", steps=3_000, refine_every=100)
+    for step, resets in ((300, False), (1_000, True)):
+        model = cloud(4, 0.9)
+        after(Densify(settings, 1.0, PHOTOGRAPHS, 4, CPU), model, step)
+        assert bool((model["opacities"] < 0.5).all()) == resets
+
+
+@pytest.mark.parametrize(("extent", "count"), [(1.0, 5), (4.0, 5)])
+def test_what_is_large_depends_on_the_extent(extent, count):
+    """Scales of 0.02: of a scene of size 1 that is split into smaller ones, of one of size 4 it is cloned."""
+    model = cloud(4)
+    model.groups["scales"].values.fill_(0.02)
+    model.groups["scales"].parameters.fill_(math.log(0.02))
+    strategy = Densify(FitSettings(strategy="default", steps=30_000), extent, PHOTOGRAPHS, 4, CPU)
+    strategy.sums[1], strategy.views[1] = 1.0, 1
+    after(strategy, model, 600)
+    assert len(model) == count
+    assert bool((model["scales"] < 0.019).any()) == (extent == 1.0)
+    assert len(strategy.sums) == len(strategy.views) == count  # and it starts to count anew
+    assert not strategy.sums.any()
+    assert not strategy.views.any()
 
 
 def test_a_split_halves_keep_shape_and_place():
@@ -155,7 +206,7 @@ def test_a_split_halves_keep_shape_and_place():
     model = cloud(1)
     model.keep(torch.zeros(count, dtype=torch.int64))
     parent = model.gaussians()
-    strategy = Densify(FitSettings(strategy="default", steps=30_000, cap=3 * count), 1.0, count, CPU)
+    strategy = Densify(FitSettings(strategy="default", steps=30_000, cap=3 * count), 1.0, PHOTOGRAPHS, count, CPU)
     strategy._split(model, torch.arange(count), 600)
     children = model.gaussians().means[count:].double() - parent.means[0].double()
     w, x, y, z = parent.quats[0].double().tolist()
@@ -197,7 +248,9 @@ def spied(monkeypatch):
 
     spy(trainer, "rasterize_with_gradients")
     spy(trainer, "photometric_loss")
+    spy(trainer, "psnr")
     spy(trainer._Run, "measure")
+    spy(Model, "update")
     spy(MarkovChain, "after_step")
     spy(Exposure, "update")
     return calls
@@ -252,13 +305,95 @@ def test_measured_before_the_refinement(boards, spied):
 
 def test_exposures_follow_the_share_of_the_run(boards, spied):
     short_fit(boards, replace(SHORT, exposure=True))
-    shares = [arguments[3] for name, arguments, _ in spied if name == "update"]
+    shares = [arguments[3] for name, arguments, _ in spied if name == "update" and isinstance(arguments[0], Exposure)]
     assert shares == pytest.approx([step / 12 for step in range(12)])
 
 
 def test_the_loss_has_its_share_of_similarity(boards, spied):
     short_fit(boards, replace(SHORT, similarity_share=0.7))
     assert {arguments[2] for name, arguments, _ in spied if name == "photometric_loss"} == {0.7}
+
+
+def test_cameras_of_the_steps(boards, spied):
+    """All photographs in turn, in an order that the seed decides."""
+
+    def poses(seed: int) -> list[tuple[float, ...]]:
+        spied.clear()
+        short_fit(boards, replace(SHORT, seed=seed, steps=14))
+        found = [args[4] for name, args, _ in spied if name == "rasterize_with_gradients"]
+        return [tuple(pose.flatten().tolist()) for pose in found]
+
+    one, other = poses(0), poses(1)
+    for turns in (one, other):
+        assert len(set(turns[:7])) == 7
+        assert set(turns[:7]) == set(turns[7:])
+    assert set(one) == set(other)
+    assert one != other
+
+
+def test_rates_of_the_centres_fall_in_the_loop(boards, spied):
+    short_fit(boards)
+    rates = [args[2] for name, args, _ in spied if name == "update" and isinstance(args[0], Model)]
+    assert len(rates) == 12
+    for step, rate in enumerate(rates):
+        assert rate / rates[0] == pytest.approx(0.01 ** (step / 12))
+
+
+def test_what_is_measured(boards, spied):
+    """Held-out views with their masks, before the background of the run."""
+    mask = torch.ones(48, 64, dtype=torch.bool)
+    mask[:, :9] = False
+    short_fit(boards, replace(SHORT, steps=4, background="white"), masks=lambda view: mask)
+    measured = [args for name, args, _ in spied if name == "psnr"]
+    assert measured
+    assert all(torch.equal(args[2], mask) for args in measured)
+    assert measured[-1][0][:4].min() > 0.05  # nothing of the scene there: white, and not black
+
+
+def test_the_loss_that_is_reported_is_smooth(boards, monkeypatch):
+    values: list[float] = []
+    original = trainer.photometric_loss
+
+    def noted(*arguments):
+        loss = original(*arguments)
+        values.append(float(loss.detach()))
+        return loss
+
+    monkeypatch.setattr(trainer, "photometric_loss", noted)
+    result = short_fit(boards)
+    smooth = values[0]
+    for value in values[1:]:
+        smooth = 0.99 * smooth + 0.01 * value
+    assert result.curve[-1].loss == pytest.approx(smooth)
+
+
+def test_rotations_are_returned_as_unit_quaternions(boards):
+    quats = short_fit(boards).gaussians.quats
+    torch.testing.assert_close(quats.norm(dim=1), torch.ones(len(quats)))
+
+
+def test_a_checkpoint_brings_everything_back(boards, tmp_path, monkeypatch):
+    """Exposures and what a strategy has counted: a resumed run has them as they were saved."""
+    path = tmp_path / "run.checkpoint"
+    settings = replace(SHORT, exposure=True, strategy="default")
+    short_fit(boards, settings, checkpoint=path, keep_checkpoint=True)
+    saved = torch.load(path, weights_only=True)
+    runs = []
+    original = trainer._Run.restore
+
+    def restore(run, *arguments):
+        runs.append(run)
+        return original(run, *arguments)
+
+    monkeypatch.setattr(trainer._Run, "restore", restore)
+    short_fit(boards, settings, checkpoint=path, keep_checkpoint=True, resume=True)  # no step is left to take
+    (run,) = runs
+    for part in ("strategy", "exposure"):
+        state = getattr(run, part).state()
+        assert state.keys() == saved[part].keys()
+        assert all(torch.equal(state[name], saved[part][name]) for name in state), part
+    assert saved["exposure"]["maps"].std(dim=0).any()
+    assert saved["strategy"]["views"].any()
 
 
 def test_degrees_rise_in_the_loop(boards, spied):

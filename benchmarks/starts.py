@@ -1,0 +1,90 @@
+"""What a fit starts from, and what that is worth: the room with points, without, and without poses.
+
+    SGWARP_DATA=FOLDER python -m benchmarks.starts [START ...] [--steps 1500] [--cap 30000] [--downscale 2]
+
+Each start is fitted and added to benchmarks/starts.json: PSNR of the held-out views, the gap to the fitted ones, mIoU
+of true labels lifted into the scene, and seconds. `photographs` finds the poses as well.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import os
+import tempfile
+import time
+from pathlib import Path
+from typing import Any
+
+import sgwarp as sg
+from benchmarks.room import HOLD_OUT, FullRoom, label_iou
+from sgwarp.files.atomic import atomic_path
+from sgwarp.ops.launcher import get_threads
+from sgwarp.reconstruction.fitting.initial import depth_from_folder
+from sgwarp.reconstruction.fitting.settings import FitSettings
+from sgwarp.reconstruction.sfm.features import SfmSettings
+from sgwarp.reconstruction.sfm.poses import estimate_poses
+from sgwarp.reconstruction.sfm.triangulation import triangulate
+
+STARTS = ("depth", "points", "photographs", "triangulated", "random")
+EVALUATIONS = 5
+
+
+def begin(start: str, folder: Path, work: Path, settings: FitSettings) -> tuple[list[sg.View], Any]:
+    """Views, and what to start from."""
+    sfm = SfmSettings(threads=get_threads())
+    if start == "photographs":
+        print(estimate_poses(folder / "images", work, sfm).summary())
+        return sg.load_views(work), sg.load_points(work)
+    views = sg.load_views(folder)
+    kept = [view for index, view in enumerate(views) if index % HOLD_OUT]
+    if start == "depth":
+        return views, sg.gaussians_from_depth(kept, depth_from_folder(folder / "depth"), count=settings.cap)
+    if start == "points":
+        return views, sg.load_points(folder)
+    return views, triangulate(kept, sfm) if start == "triangulated" else None
+
+
+def measure(start: str, folder: Path, settings: FitSettings, downscale: int) -> dict[str, float]:
+    """One row of the table."""
+    began = time.perf_counter()
+    with tempfile.TemporaryDirectory() as work:
+        views, first = begin(start, folder, Path(work), settings)
+        held_out = views[::HOLD_OUT]
+        kept = [view for index, view in enumerate(views) if index % HOLD_OUT]
+        fitted = sg.fit(kept, first, held_out, settings, downscale=downscale)
+        seconds = time.perf_counter() - began
+        names = json.loads((folder / "classes.json").read_text())
+        named = tuple(names[str(number)] for number in range(1, len(names)))
+        room = FullRoom(folder, fitted.gaussians, kept, held_out, named)
+        iou = label_iou(room, sg.lift(fitted.gaussians, kept, room.label_map))["mIoU"]
+    last = fitted.curve[-1].psnr
+    return {"PSNR": last, "gap": fitted.fitted_psnr - last, "mIoU": iou, "seconds": seconds}
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("starts", nargs="*", choices=[*STARTS, []], default=STARTS)
+    parser.add_argument("--steps", type=int, default=1500)
+    parser.add_argument("--cap", type=int, default=30_000)
+    parser.add_argument("--downscale", type=int, default=2)
+    parser.add_argument("--out", type=Path, default=Path(__file__).with_name("starts.json"))
+    options = parser.parse_args()
+    data = os.environ.get("SGWARP_DATA")
+    if data is None:
+        raise SystemExit("set SGWARP_DATA to the folder that holds room/")
+    steps = options.steps
+    settings = FitSettings(
+        steps=steps, cap=options.cap, evaluate_every=max(1, steps // EVALUATIONS), degree_every=max(1, steps // 4)
+    )
+    for start in options.starts:
+        row = measure(start, Path(data) / "room", settings, options.downscale)
+        results = json.loads(options.out.read_text()) if options.out.is_file() else {}
+        results[start] = row | {"steps": steps, "cap": options.cap, "downscale": options.downscale}
+        with atomic_path(options.out) as temporary:
+            temporary.write_text(json.dumps(results, indent=1) + "\n")
+        print(start, row, flush=True)
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,133 @@
+"""What an edit is applied to, as plain data.
+
+A selection is a list of terms, each a short text:
+
+| term | selects |
+|---|---|
+| lamp, or text:lamp | what the text names; whole instances where they are known |
+| id:3 | an instance |
+| box:x0,y0,z0,x1,y1,z1 | centers inside a box [m] |
+| click:STEM,x,y | the instance, or what looks alike around it, at a pixel of a view |
+| copy:1 | what the first duplication added |
+| last | what the step before was applied to, or the copy it made |
+| all | everything |
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass, fields
+from typing import Any
+
+from sgwarp.errors import InputError
+
+KINDS = ("text", "id", "box", "click", "copy")
+
+
+@dataclass(frozen=True)
+class Term:
+    """One term, taken apart: `kind` of KINDS, "all" or "last", `text` and `numbers` as it needs them."""
+
+    kind: str
+    text: str = ""
+    numbers: tuple[float, ...] = ()
+
+
+@dataclass(frozen=True)
+class Selection:
+    """Terms and what becomes of the Gaussians they select.
+
+    Attributes:
+        select: Terms; what any of them selects.
+        keep: Terms whose Gaussians are never selected.
+        negatives: Phrases that a Gaussian must fit less than the text.
+        threshold: Least score of a text, where 0 is the scene's median and 1 its best thousandth.
+        grow: Add what lies within this distance, or if negative take away what lies within it of the rest [m].
+        clean: Leave out scattered pieces that hold less than a tenth of the largest one.
+
+    Raises:
+        InputError: A term is malformed, or a number not finite.
+    """
+
+    select: tuple[str, ...]
+    keep: tuple[str, ...] = ()
+    negatives: tuple[str, ...] = ()
+    threshold: float = 0.5
+    grow: float = 0.0
+    clean: bool = True
+
+    def __post_init__(self) -> None:
+        if not self.select:
+            raise InputError("select: give at least one term, such as a text, id:3 or box:x0,y0,z0,x1,y1,z1")
+        for term in (*self.select, *self.keep):
+            parse_term(term)
+        if not all(isinstance(text, str) and text.strip() for text in self.negatives):
+            raise InputError("negatives: a phrase is empty")
+        for name in ("threshold", "grow"):
+            value = getattr(self, name)
+            if isinstance(value, bool) or not isinstance(value, (int, float)) or not math.isfinite(value):
+                raise InputError(f"{name}: expected a finite number, got {value!r}")
+        if not isinstance(self.clean, bool):
+            raise InputError(f"clean: expected true or false, got {self.clean!r}")
+
+
+def parse_term(term: str) -> Term:
+    """A term taken apart.
+
+    Raises:
+        InputError: It is empty, or its numbers are missing or malformed.
+    """
+    if not isinstance(term, str) or not term.strip():
+        raise InputError(f"select: a term is a text that is not empty, got {term!r}")
+    kind, colon, rest = term.partition(":")
+    if term in ("all", "last"):
+        return Term(term)
+    if not colon or kind not in KINDS:
+        return Term("text", term.strip())
+    if kind == "text":
+        if not rest.strip():
+            raise InputError(f"select '{term}': write text:PHRASE")
+        return Term("text", rest.strip())
+    if kind in ("id", "copy"):
+        (number,) = _numbers(term, rest, 1, f"{kind}:NUMBER")
+        if number < 1 or number != int(number):
+            raise InputError(f"select '{term}': expected a whole number from 1 on")
+        return Term(kind, numbers=(number,))
+    if kind == "box":
+        corners = _numbers(term, rest, 6, "box:x0,y0,z0,x1,y1,z1")
+        if any(low > high for low, high in zip(corners[:3], corners[3:], strict=True)):
+            raise InputError(f"select '{term}': the first corner must be the lower one in x, y and z")
+        return Term(kind, numbers=corners)
+    stem, _, pixel = rest.partition(",")
+    return Term(kind, stem, _numbers(term, pixel, 2, "click:STEM,x,y"))
+
+
+def _numbers(term: str, text: str, count: int, form: str) -> tuple[float, ...]:
+    try:
+        numbers = tuple(float(part) for part in text.split(","))
+    except ValueError:
+        numbers = ()
+    if len(numbers) != count or not all(math.isfinite(number) for number in numbers):
+        raise InputError(f"select '{term}': write {form}")
+    return numbers
+
+
+def selection_from(content: Mapping[str, Any]) -> Selection:
+    """The selection among the entries of a step of a script.
+
+    Raises:
+        InputError: `select` is missing, or an entry has the wrong type.
+    """
+    given: dict[str, Any] = {}
+    for name in (attribute.name for attribute in fields(Selection) if attribute.name in content):
+        value = content[name]
+        if name in ("select", "keep", "negatives"):
+            value = [value] if isinstance(value, str) else value
+            if not isinstance(value, (list, tuple)):
+                raise InputError(f"{name}: expected a list of texts, got {value!r}")
+            value = tuple(value)
+        given[name] = value
+    if "select" not in given:
+        raise InputError("select: is missing; every step says what it is applied to")
+    return Selection(**given)

@@ -1,0 +1,1 @@
+"""Instances and parts: masks that agree in nothing but the Gaussians they show, joined into objects."""

@@ -1,0 +1,431 @@
+"""Operations against closed forms and pictures, selections against geometry, sessions and scripts by their bits."""
+
+import dataclasses
+import json
+import math
+
+import pytest
+import torch
+
+from sgwarp.apps.editing import operations as ops
+from sgwarp.apps.editing.measurement import measure_edit
+from sgwarp.apps.editing.picker import EditContext, grow, largest_pieces, pick
+from sgwarp.apps.editing.script import EditStep, load_script, save_script, step_from
+from sgwarp.apps.editing.selection import Selection, parse_term
+from sgwarp.apps.editing.session import HISTORY, EditSession, edit
+from sgwarp.errors import InputError
+from sgwarp.ops.planar.harmonics_rotation import rotate_harmonics, rotation_of_harmonics
+from sgwarp.ops.reference.rasterizer import harmonics, rotation_matrices
+from sgwarp.ops.splatting.settings import RasterSettings
+from sgwarp.rendering.renderer import render
+from sgwarp.scene import Camera, Instance, InstanceMap, Semantics
+
+FIELDS = ("means", "quats", "scales", "opacities", "sh")
+QUAT = torch.tensor([0.7, -0.3, 0.5, 0.4], dtype=torch.float64)
+QUAT = QUAT / QUAT.norm()
+ALL = Selection(("all",), clean=False)
+
+
+def same(one, other) -> bool:
+    return all(torch.equal(getattr(one, name), getattr(other, name)) for name in FIELDS)
+
+
+def sphere(count: int) -> torch.Tensor:
+    directions = torch.randn(count, 3, dtype=torch.float64, generator=torch.Generator().manual_seed(0))
+    return torch.nn.functional.normalize(directions, dim=1)
+
+
+# Harmonics
+
+
+def test_rotated_harmonics_are_the_rotated_function():
+    turn = rotation_matrices(QUAT[None])[0]
+    matrix = rotation_of_harmonics(turn, 3)
+    directions = sphere(200)
+    here, there = harmonics(directions, 3), harmonics(directions @ turn, 3)  # rows of d @ R are R^T d
+    assert float((here @ matrix - there).abs().max()) < 1e-13
+    assert float((matrix @ matrix.T - torch.eye(16, dtype=torch.float64)).abs().max()) < 1e-13
+
+
+def test_two_turns_are_their_product():
+    first, second = rotation_matrices(torch.stack([QUAT, torch.tensor([0.6, 0.8, 0.0, 0.0]).double()]))
+    both = rotation_of_harmonics(first @ second, 3)
+    assert float((rotation_of_harmonics(first, 3) @ rotation_of_harmonics(second, 3) - both).abs().max()) < 1e-13
+
+
+def test_harmonics_turn_as_in_splatreg():
+    """An independent implementation, by recursion over the degrees."""
+    from splatreg import sh
+
+    turn = rotation_matrices(QUAT[None])[0]
+    coefficients = torch.randn(5, 16, 3, dtype=torch.float64, generator=torch.Generator().manual_seed(1))
+    torch.testing.assert_close(
+        rotate_harmonics(coefficients, turn), sh.rotate_sh(coefficients, turn), rtol=0, atol=1e-12
+    )
+
+
+@pytest.mark.parametrize("degree", [0, 1, 2, 3])
+def test_the_rotated_scene_from_the_rotated_camera_is_the_original_picture(scenes, degree):
+    gaussians = scenes.cloud(300, seed=degree, degree=degree)
+    camera = scenes.pinhole()
+    settings = RasterSettings(alpha_min=2.0**-16, transmittance_min=0.0)  # crossing a threshold must not be visible
+    center = torch.tensor([0.3, -0.2, 4.0], dtype=torch.float64)
+    chosen = torch.ones(300, dtype=torch.bool)
+    turned = ops.rotate_gaussians(gaussians, chosen, QUAT, center)
+    turn = rotation_matrices(QUAT[None])[0]
+    back = torch.eye(4, dtype=torch.float64)  # x' = R (x - c) + c
+    back[:3, :3], back[:3, 3] = turn.T, center - turn.T @ center
+    moved = Camera(camera.K, camera.world_to_camera @ back, camera.width, camera.height)
+    before, after = render(gaussians, camera, settings=settings), render(turned, moved, settings=settings)
+    assert float((before - after).abs().max()) < 1e-5
+    assert float(before.std()) > 0.1
+    plain = render(dataclasses.replace(turned, sh=gaussians.sh), moved, settings=settings)
+    assert degree == 0 or float((before - plain).abs().max()) > 1e-2, "without turning the harmonics it shows"
+
+
+# Operations
+
+
+@pytest.fixture
+def half(scenes):
+    """A cloud and its first half."""
+    return scenes.cloud(60, seed=5, degree=2), torch.arange(60) < 30
+
+
+def test_remove_extract_and_isolate(half):
+    gaussians, chosen = half
+    assert same(ops.Remove().apply(gaussians, chosen).gaussians, gaussians.subset(~chosen))
+    assert same(ops.Extract().apply(gaussians, chosen).gaussians, gaussians.subset(chosen))
+    faded = ops.Isolate(0.25).apply(gaussians, chosen).gaussians
+    torch.testing.assert_close(faded.opacities[~chosen], gaussians.opacities[~chosen] * 0.25)
+    assert torch.equal(faded.opacities[chosen], gaussians.opacities[chosen])
+
+
+def test_move_shifts_the_selection_alone(half):
+    gaussians, chosen = half
+    moved = ops.Move((1.0, -2.0, 0.5)).apply(gaussians, chosen).gaussians
+    torch.testing.assert_close(moved.means[chosen] - gaussians.means[chosen], torch.tensor([[1.0, -2.0, 0.5]] * 30))
+    assert torch.equal(moved.means[~chosen], gaussians.means[~chosen])
+    assert moved.sh is gaussians.sh
+
+
+def test_rotate_keeps_the_centroid_and_turns_covariances(half):
+    gaussians, chosen = half
+    turned = ops.Rotate((0.0, 0.0, 2.0), 90.0).apply(gaussians, chosen).gaussians
+    turn = torch.tensor([[0.0, -1, 0], [1, 0, 0], [0, 0, 1]]).double()
+    center = ops.centroid(gaussians, chosen)
+    torch.testing.assert_close(ops.centroid(turned, chosen), center, rtol=0, atol=1e-6)
+
+    def covariances(g):
+        axes = rotation_matrices(g.quats[chosen].double()) * g.scales[chosen].double()[:, None, :]
+        return axes @ axes.mT
+
+    torch.testing.assert_close(covariances(turned), turn @ covariances(gaussians) @ turn.T, rtol=1e-5, atol=1e-8)
+    torch.testing.assert_close(
+        turned.means[chosen].double(), center + (gaussians.means[chosen].double() - center) @ turn.T, rtol=0, atol=1e-6
+    )
+    assert torch.equal(turned.sh[~chosen], gaussians.sh[~chosen])
+
+
+def test_scale_is_about_the_centroid(half):
+    gaussians, chosen = half
+    scaled = ops.Scale(2.0).apply(gaussians, chosen).gaussians
+    torch.testing.assert_close(scaled.scales[chosen], 2 * gaussians.scales[chosen])
+    center = ops.centroid(gaussians, chosen).float()
+    torch.testing.assert_close(scaled.means[chosen] - center, 2 * (gaussians.means[chosen] - center), rtol=0, atol=1e-5)
+
+
+def test_recolor_keeps_the_shading_from_every_direction(half):
+    """Color c seen from d becomes target * luma(c) / mean luma, whatever d."""
+    gaussians, chosen = half
+    target = torch.tensor([0.1, 0.6, 0.15], dtype=torch.float64)
+    painted = ops.Recolor((0.1, 0.6, 0.15)).apply(gaussians, chosen).gaussians
+    basis = harmonics(sphere(20), 2)
+
+    def colors(g):
+        return 0.5 + torch.einsum("dk,nkc->ndc", basis, g.sh[chosen].double())
+
+    luma = torch.tensor([0.2126, 0.7152, 0.0722], dtype=torch.float64)
+    weight = gaussians.opacities[chosen].double()
+    base = 0.5 + 0.28209479177387814 * gaussians.sh[chosen, 0].double()
+    mean = ((base @ luma) * weight).sum() / weight.sum()
+    wanted = (colors(gaussians) @ luma)[..., None] / mean * target
+    torch.testing.assert_close(colors(painted), wanted, rtol=1e-5, atol=1e-6)
+    assert torch.equal(painted.sh[~chosen], gaussians.sh[~chosen])
+
+
+def test_duplicate_adds_shifted_copies_at_the_end(half):
+    gaussians, chosen = half
+    change = ops.Duplicate((0.0, 1.0, 0.0)).apply(gaussians, chosen)
+    assert (len(change.gaussians), change.added) == (90, 30)
+    assert same(change.gaussians.subset(torch.arange(60)), gaussians)
+    torch.testing.assert_close(change.gaussians.means[60:, 1], gaussians.means[chosen, 1] + 1.0)
+    assert change.rows[60:].tolist() == list(range(30))
+
+
+@pytest.mark.parametrize(
+    ("content", "message"),
+    [
+        ({"do": "explode"}, "do: expected one of"),
+        ({"do": "move", "by": [1, 2]}, "by is three numbers"),
+        ({"do": "move", "by": [1, 2, math.nan]}, "expected a finite number"),
+        ({"do": "scale", "factor": 0}, "positive factor"),
+        ({"do": "rotate", "axis": [0, 0, 0]}, "the axis has no direction"),
+        ({"do": "recolor", "color": [2, 0, 0]}, "from 0 to 1"),
+        ({"do": "recolor", "color": "mauve-ish"}, "color 'mauve-ish'"),
+        ({"do": "isolate", "fade": 1}, "fade is a factor"),
+        ({"do": "remove", "hard": True}, "has no entry 'hard'"),
+    ],
+)
+def test_operations_are_checked(content, message):
+    with pytest.raises(InputError, match=message):
+        step_from({"select": ["all"]} | content)
+
+
+def test_colors_have_names_and_codes():
+    assert ops.parse_color("green") == ops.COLORS["green"]
+    assert ops.parse_color("#ff8000") == (1.0, 128 / 255, 0.0)
+    assert ops.parse_color("0.1,0.2,0.3") == (0.1, 0.2, 0.3)
+
+
+# Selections
+
+
+@pytest.fixture(scope="module")
+def context(stage, toy_text):
+    """Everything a selection may ask for: semantics of the panels, instances 1 to 4 = wall, door, lamp, book."""
+    count = len(stage.classes)
+    features = torch.nn.functional.one_hot(stage.classes - 1, 5).float()
+    fingerprint = stage.gaussians.fingerprint
+    semantics = Semantics(features, torch.ones(count), torch.ones(count), "toy", fingerprint)
+    zero = (0.0, 0.0, 0.0)
+    table = tuple(
+        Instance(k, "default", 0, 1, 1, 1, 1.0, zero, (1.0, 0.0, 0.0, 0.0), zero, label)
+        for k, label in enumerate(("wall", "left door", "lamp", "book"), start=1)
+    )
+    instances = InstanceMap(
+        stage.classes[None, :, None],
+        torch.ones(1, count, 1),
+        torch.full((count,), 9.0),
+        table,
+        ("default",),
+        fingerprint,
+    )
+    return EditContext(semantics, toy_text, instances, stage.views)
+
+
+def picked(stage, context, *terms, **options) -> torch.Tensor:
+    return EditSession(stage.gaussians, context).preview(Selection(terms, **options))
+
+
+def test_texts_name_gaussians_and_whole_instances(stage, context):
+    for number, text in enumerate(("left door", "lamp", "book"), start=2):
+        assert torch.equal(picked(stage, context, text), stage.classes == number)
+        alone = dataclasses.replace(context, instances=None)
+        assert torch.equal(picked(stage, alone, text), stage.classes == number)
+    both = picked(stage, context, "lamp", "text:book")
+    assert torch.equal(both, stage.classes >= 3)
+
+
+def test_without_semantics_a_text_is_a_label(stage, context):
+    labels = dataclasses.replace(context, semantics=None, encoder=None)
+    assert torch.equal(picked(stage, labels, "lamp"), stage.classes == 3)
+    with pytest.raises(InputError, match="select 'sofa': needs --semantics"):
+        picked(stage, labels, "sofa")
+
+
+def test_negatives_win_where_they_fit_better(stage, context):
+    with pytest.raises(InputError, match="selects no Gaussian"):
+        picked(stage, context, "lamp", negatives=("lamp",))
+
+
+def test_ids_boxes_and_keep(stage, context):
+    assert torch.equal(picked(stage, context, "id:4"), stage.classes == 4)
+    inside = picked(stage, context, "box:-9,-9,2.9,9,9,3.1")
+    assert torch.equal(inside, stage.classes == 2)
+    rest = picked(stage, context, "all", keep=("wall", "id:2"), clean=False)
+    assert torch.equal(rest, stage.classes >= 3)
+
+
+def test_a_click_selects_what_is_in_front(stage, context):
+    view = stage.views[0]
+    for number in (2, 3, 4):
+        y, x = (stage.labels(view) == number).nonzero().float().mean(0).long().tolist()
+        assert int(stage.labels(view)[y, x]) == number
+        assert torch.equal(picked(stage, context, f"click:{view.stem},{x},{y}"), stage.classes == number)
+        alike = dataclasses.replace(context, instances=None)
+        assert torch.equal(picked(stage, alike, f"click:{view.stem},{x},{y}"), stage.classes == number)
+
+
+def test_growing_and_shrinking_are_distances(stage, context):
+    lamp = stage.classes == 3
+    distance = torch.cdist(stage.gaussians.means.double(), stage.gaussians.means[lamp].double()).amin(dim=1)
+    assert torch.equal(picked(stage, context, "lamp", grow=0.35), distance <= 0.35)
+    rest = torch.cdist(stage.gaussians.means.double(), stage.gaussians.means[~lamp].double()).amin(dim=1)
+    small = grow(stage.gaussians.means, lamp, -0.6)
+    assert torch.equal(small, lamp & (rest > 0.6))
+    assert 0 < int(small.sum()) < int(lamp.sum())
+
+
+def test_scattered_pieces_are_left_out(stage):
+    lamp = stage.classes == 3
+    dirty = lamp.clone()
+    dirty[(stage.classes == 1).nonzero().flatten()[[10, 11, 900]]] = True
+    assert torch.equal(largest_pieces(stage.gaussians.means, dirty), lamp)
+    both = (stage.classes == 3) | (stage.classes == 4)
+    assert torch.equal(largest_pieces(stage.gaussians.means, both), both), "two large pieces both stay"
+
+
+@pytest.mark.parametrize(
+    ("term", "message"),
+    [
+        ("id:9", "instance 9: unknown id; this scene has 1 to 4"),
+        ("copy:1", "there are 0 copies so far"),
+        ("last", "selects no Gaussian"),
+        ("box:5,5,5,6,6,6", "selects no Gaussian"),
+        ("click:nowhere,1,1", "there is no such view"),
+        ("click:0000,4000,1", "outside the image"),
+    ],
+)
+def test_what_cannot_be_selected(stage, context, term, message):
+    with pytest.raises(InputError, match=message):
+        picked(stage, context, term)
+
+
+@pytest.mark.parametrize(
+    "term", ["", "  ", "id:x", "id:0", "id:1.5", "box:1,2,3", "box:1,0,0,0,1,1", "click:a", "text:"]
+)
+def test_malformed_terms(term):
+    with pytest.raises(InputError, match="select"):
+        parse_term(term)
+
+
+def test_selections_need_what_they_ask_for(stage):
+    for term in ("lamp", "id:1"):
+        with pytest.raises(InputError, match="needs --"):
+            picked(stage, EditContext(), term)
+    with pytest.raises(InputError, match="at least one term"):
+        Selection(())
+
+
+# Sessions and scripts
+
+STEPS = (
+    EditStep(Selection(("lamp",)), ops.Move((0.0, 0.0, -0.3))),
+    EditStep(Selection(("last",), clean=False), ops.Rotate((0.0, 1.0, 0.0), 40.0)),
+    EditStep(Selection(("left door",)), ops.Recolor((0.1, 0.6, 0.15))),
+    EditStep(Selection(("book",)), ops.Duplicate((-1.0, 0.0, 0.0))),
+    EditStep(Selection(("copy:1",)), ops.Scale(1.5)),
+    EditStep(Selection(("id:1",), clean=False), ops.Remove()),
+)
+
+
+def test_undo_and_redo_give_back_the_same_bits(stage, context):
+    session = EditSession(stage.gaussians, context)
+    states = [session.state, *(session.apply(step) for step in STEPS)]
+    for state in states[-2::-1]:
+        assert same(session.undo().gaussians, state.gaussians)
+    assert same(session.state.gaussians, stage.gaussians)
+    assert session.undone == STEPS
+    for state in states[1:]:
+        assert same(session.redo().gaussians, state.gaussians)
+    assert session.steps == STEPS
+    with pytest.raises(InputError, match="no step was undone"):
+        session.redo()
+
+
+def test_a_long_history_is_replayed(stage, context):
+    session = EditSession(stage.gaussians, context)
+    step = EditStep(Selection(("lamp",)), ops.Move((0.01, 0.0, 0.0)))
+    states = [session.state.gaussians] + [session.apply(step).gaussians for _ in range(HISTORY + 6)]
+    assert len(session._states) <= HISTORY + 1
+    for wanted in states[-2::-1]:
+        assert same(session.undo().gaussians, wanted)
+    for wanted in states[1:]:
+        assert same(session.redo().gaussians, wanted)
+
+
+def test_a_new_step_forgets_what_was_undone(stage, context):
+    session = EditSession(stage.gaussians, context)
+    for step in STEPS[:3]:
+        session.apply(step)
+    session.undo()
+    session.undo()
+    state = session.apply(STEPS[3])
+    assert session.steps == (STEPS[0], STEPS[3])
+    assert session.undone == ()
+    assert same(state.gaussians, edit(stage.gaussians, [STEPS[0], STEPS[3]], context).gaussians)
+
+
+def test_a_failing_step_changes_nothing(stage, context):
+    session = EditSession(stage.gaussians, context)
+    before = session.apply(STEPS[0])
+    with pytest.raises(InputError, match="would leave no Gaussian"):
+        session.apply(EditStep(ALL, ops.Remove()))
+    assert session.state is before
+    assert session.steps == STEPS[:1]
+    with pytest.raises(InputError, match="step 2: remove: would leave no Gaussian"):
+        edit(stage.gaussians, [STEPS[0], EditStep(ALL, ops.Remove())], context)
+    with pytest.raises(InputError, match="no step to apply"):
+        edit(stage.gaussians, [], context)
+    with pytest.raises(InputError, match="undo: no step"):
+        EditSession(stage.gaussians).undo()
+
+
+def test_rows_lead_back_to_the_scene(stage, context):
+    state = edit(stage.gaussians, STEPS[3:], context)
+    assert len(state.gaussians) == int((stage.classes > 1).sum() + (stage.classes == 4).sum())
+    classes = stage.classes[state.rows]
+    assert torch.equal(classes[state.copies == 1], torch.full((int((stage.classes == 4).sum()),), 4))
+    assert int(classes.min()) == 2
+    assert torch.equal(pick(state, Selection(("book",), clean=False), context), classes == 4)
+
+
+def test_a_script_replays_to_the_same_bits(stage, context, tmp_path):
+    path = tmp_path / "ops.json"
+    save_script(STEPS, stage.gaussians, path)
+    assert load_script(path, stage.gaussians) == STEPS
+    one, other = edit(stage.gaussians, STEPS, context), edit(stage.gaussians, load_script(path), context)
+    assert same(one.gaussians, other.gaussians)
+    written = json.loads(path.read_text())["steps"]
+    assert written[0] == {"select": ["lamp"], "do": "move", "by": [0.0, 0.0, -0.3]}
+
+
+def test_damaged_scripts(stage, tmp_path):
+    path = tmp_path / "ops.json"
+    save_script(STEPS, stage.gaussians, path)
+    with pytest.raises(InputError, match="was made for scene"):
+        load_script(path, stage.gaussians.subset(torch.arange(5)))
+    good = json.loads(path.read_text())
+    cases = [
+        ("{", "is not JSON"),
+        (json.dumps([1]), "is no edit script"),
+        (json.dumps(good | {"version": 2}), "has version 2"),
+        (json.dumps(good | {"steps": []}), "expected a list"),
+        (json.dumps(good | {"steps": [3]}), "step 1: a step is an object"),
+        (json.dumps(good | {"steps": [good["steps"][0], {"do": "remove"}]}), "step 2: select: is missing"),
+        (json.dumps(good | {"steps": [{"select": ["a"], "do": "remove", "grow": "x"}]}), "step 1: grow"),
+    ]
+    for text, message in cases:
+        path.write_text(text)
+        with pytest.raises(InputError, match=message):
+            load_script(path, stage.gaussians)
+
+
+def test_a_context_of_another_scene_is_refused(stage, context):
+    other = dataclasses.replace(stage.gaussians, means=stage.gaussians.means + 1)
+    with pytest.raises(InputError, match="belong to scene"):
+        EditSession(other, context)
+
+
+def test_leakage_and_completeness_count_pixels():
+    before, after = torch.zeros(4, 5, 3), torch.zeros(4, 5, 3)
+    mask = torch.zeros(4, 5, dtype=torch.bool)
+    mask[0] = True
+    after[0, :4] = 0.5
+    after[1, 0, 2] = 0.1
+    after[2, 0] = 0.03  # too little to see
+    found = measure_edit(before, after, mask)
+    assert (found.leakage, found.completeness) == (pytest.approx(1 / 5), pytest.approx(4 / 5))
+    with pytest.raises(InputError, match="the mask is empty"):
+        measure_edit(before, after, torch.zeros_like(mask))

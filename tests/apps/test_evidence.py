@@ -1,0 +1,242 @@
+"""Evidence, association and counts against dense float64 formulas; boxes and agreement against closed forms."""
+
+import numpy as np
+import pytest
+import torch
+
+from sgwarp.apps.instances import counts as counting
+from sgwarp.apps.instances.association import (
+    MaskGraph,
+    build_graph,
+    join_masks,
+    name_groups,
+    priorities,
+    sampling_rates,
+)
+from sgwarp.apps.instances.consistency import agreement
+from sgwarp.apps.instances.description import oriented_box, quaternion
+from sgwarp.apps.instances.evidence import ViewEvidence, view_evidence
+from sgwarp.apps.instances.settings import InstanceSettings
+from sgwarp.encoders.masks.sources import ViewMasks
+from sgwarp.ops.reference import lifting as reference
+from sgwarp.ops.reference.rasterizer import rotation_matrices
+from sgwarp.ops.splatting.settings import RasterSettings
+from sgwarp.scene import View
+
+EXACT = InstanceSettings(samples_per_mask=0)
+
+
+def random_masks(camera, count, seed) -> torch.Tensor:
+    """Overlapping rectangles."""
+    random = np.random.default_rng(seed)
+    masks = torch.zeros(count, *camera.size, dtype=torch.bool)
+    for mask in masks:
+        y, x = random.integers(0, camera.height - 8), random.integers(0, camera.width - 8)
+        mask[y : y + random.integers(4, 30), x : x + random.integers(4, 40)] = True
+    return masks
+
+
+@pytest.fixture(scope="module")
+def seen(stage):
+    """Evidence of three views with overlapping masks, and the dense weights behind it, float64 [N, M] and [N]."""
+    evidence, dense = [], []
+    for number, view in enumerate(stage.views[:3]):
+        masks = random_masks(view.camera, 5 + number, number)
+        found = ViewMasks.without_empty(masks, torch.full((len(masks),), -1))
+        evidence.append(view_evidence(stage.gaussians, view, found, RasterSettings()))
+        one = reference.lift_weighted(stage.gaussians, view.camera, masks.permute(1, 2, 0).double())
+        dense.append((one.features.numpy(), one.weight.numpy()))
+    return evidence, dense
+
+
+def test_evidence_is_the_transpose_of_the_renderer(stage, seen):
+    for view, (weights, total) in zip(*seen, strict=True):
+        owner, mask, weight = view.mask_pairs(view.masks_of("default"))
+        found = np.zeros_like(weights)
+        np.add.at(found, (owner, mask), weight)
+        np.testing.assert_allclose(found, weights, rtol=1e-4, atol=2e-5 * weights.max())
+        np.testing.assert_allclose(view.totals(len(stage.gaussians)), total, rtol=1e-4, atol=2e-5 * total.max())
+        assert view.nbytes == 10 * len(view.gaussians)
+
+
+def dense_overlaps(dense) -> tuple[np.ndarray, np.ndarray]:
+    """O between all masks and V of all masks in all views, written out."""
+    mass = [total**3 / (total**2 + 1.0) for _, total in dense]
+    shares = [weights / np.maximum(total, 1e-300)[:, None] for weights, total in dense]
+    blocks = [
+        [np.einsum("ia,ib,i->ab", s, t, np.sqrt(m * n)) for t, n in zip(shares, mass, strict=True)]
+        for s, m in zip(shares, mass, strict=True)
+    ]
+    visible = [[np.einsum("ia,i->a", s, np.sqrt(m * n)) for n in mass] for s, m in zip(shares, mass, strict=True)]
+    return np.block(blocks), np.block([[np.stack(row, axis=1)] for row in visible])
+
+
+def test_overlaps_are_those_of_the_formula(stage, seen):
+    evidence, dense = seen
+    graph = build_graph(evidence, "default", len(stage.gaussians), EXACT)
+    shared, visible = dense_overlaps(dense)
+    np.testing.assert_allclose(graph.visible, visible, rtol=1e-3, atol=1e-4 * visible.max())
+    found = np.zeros_like(shared)
+    found[graph.first, graph.second] = graph.shared
+    own = visible[np.arange(len(shared)), graph.view_of]
+    wanted = np.triu(shared, 1) * (graph.view_of[:, None] != graph.view_of)
+    faint = wanted <= 0.0101 * np.minimum(own[:, None], own)
+    np.testing.assert_allclose(found[~faint], wanted[~faint], rtol=1e-3)
+    assert bool((found[wanted < 0.0099 * np.minimum(own[:, None], own)] == 0).all())
+
+
+def test_a_sample_estimates_the_overlaps(stage, seen):
+    evidence, _ = seen
+    count = len(stage.gaussians)
+    whole = build_graph(evidence, "default", count, EXACT)
+    part = build_graph(evidence, "default", count, InstanceSettings(samples_per_mask=200))
+    assert int((sampling_rates(evidence, "default", count, 200) < 1).sum()) > count / 4
+    own = whole.visible[np.arange(len(whole.view_of)), whole.view_of]
+    error = np.abs(part.visible - whole.visible) / own[:, None]
+    assert error.max() < 4 / 200**0.5, "four standard errors of a sum over 200 samples"
+    assert 0 < error.mean() < 0.05
+
+
+def test_priorities_are_fixed_and_spread_evenly():
+    found = priorities(100_000)
+    assert 0 < found.min() < found.max() <= 1
+    np.testing.assert_allclose(np.histogram(found, bins=10, range=(0, 1))[0], 10_000, rtol=0.05)
+    np.testing.assert_array_equal(priorities(10), found[:10])
+
+
+def graph_of(overlaps: dict[tuple[int, int], float], view_of: list[int]) -> MaskGraph:
+    """Masks of mass 1, all of which every view shows whole."""
+    first, second = (np.array(side, np.int64) for side in zip(*overlaps, strict=True))
+    views = max(view_of) + 1
+    return MaskGraph(
+        first, second, np.array(list(overlaps.values())), np.ones((len(view_of), views)), np.array(view_of, np.int64)
+    )
+
+
+def test_best_partners_are_joined_first():
+    """Mask 2 fits 1 better than 0, which is of the view of 1: 0 stays alone."""
+    graph = graph_of({(0, 2): 0.7, (1, 2): 0.9}, [0, 0, 1])
+    assert join_masks(graph, EXACT).tolist() == [0, 1, 1]
+
+
+def test_iou_and_shared_mass_are_thresholds():
+    """O = 0.4 of masks of mass 1 is an IoU of 0.4 / 1.6."""
+    graph = graph_of({(0, 1): 0.4}, [0, 1])
+    assert len(set(join_masks(graph, InstanceSettings(least_iou=0.24)).tolist())) == 1
+    assert len(set(join_masks(graph, InstanceSettings(least_iou=0.26)).tolist())) == 2
+    faint = MaskGraph(
+        np.array([0]), np.array([1]), np.array([0.05]), np.array([[1.0, 0.05], [0.05, 1.0]]), np.array([0, 1])
+    )
+    assert len(set(join_masks(faint, InstanceSettings(least_shared=0.04)).tolist())) == 1
+    assert len(set(join_masks(faint, InstanceSettings(least_shared=0.06)).tolist())) == 2
+
+
+def test_features_can_forbid():
+    graph = graph_of({(0, 1): 0.9}, [0, 1])
+    other = MaskGraph(graph.first, graph.second, graph.shared, graph.visible, graph.view_of, np.eye(2))
+    assert len(set(join_masks(other, InstanceSettings(least_cosine=0.5)).tolist())) == 2
+    assert len(set(join_masks(other, InstanceSettings()).tolist())) == 1
+
+
+def test_no_group_has_two_masks_of_a_view():
+    random = np.random.default_rng(0)
+    view_of = np.sort(random.integers(0, 12, 60))
+    pairs = [(a, b) for a in range(60) for b in range(a + 1, 60) if view_of[a] != view_of[b]]
+    graph = graph_of(dict(zip(pairs, random.random(len(pairs)), strict=True)), view_of.tolist())
+    groups = join_masks(graph, InstanceSettings(least_iou=0.1, least_shared=0.0))
+    keys = groups * 100 + view_of
+    assert len(np.unique(keys)) == 60
+    assert len(np.unique(groups)) < 30
+
+
+def hand_made(gaussians, sets, weights, members, names=()) -> ViewEvidence:
+    return ViewEvidence(
+        "v",
+        np.array(gaussians, np.int32),
+        np.array(sets, np.int16),
+        np.array(weights, np.float32),
+        np.array(members, bool),
+        np.full(len(members[0]), -1),
+        tuple(names),
+    )
+
+
+def test_counts_by_hand():
+    """Gaussian 0: 2 px of mask A, 1 px of A and B, so 9 / (9 + 1) views; 1: 1 px of no mask, 1 / (1 + 1) views."""
+    view = hand_made([0, 0, 1], [0, 1, 2], [2.0, 1.0, 1.0], [[1, 0], [1, 1], [0, 0]])
+    found = counting.count_groups([view], "default", np.array([0, 1]), 2, 1.0).toarray()
+    np.testing.assert_allclose(found, [[0.0, 0.9 * 2.5 / 3, 0.9 * 0.5 / 3], [0.5, 0.0, 0.0]], rtol=1e-6)
+
+
+def test_candidates_are_sorted_and_filled_up():
+    from scipy import sparse
+
+    counts = sparse.csr_matrix(np.array([[0.0, 1.0, 3.0], [0, 0, 0], [2.0, 2.0, 0.0]], np.float32))
+    columns, shares, total = counting.best_candidates(counts, 2)
+    assert columns.tolist() == [[2, 1], [-1, -1], [0, 1]]
+    np.testing.assert_allclose(shares, [[0.75, 0.25], [0, 0], [0.5, 0.5]])
+    assert total.tolist() == [4.0, 0.0, 4.0]
+
+
+def test_neighbors_speak_for_the_unsure_alone():
+    """Gaussian 1 is torn between two groups, its neighbors belong to the first; the fourth was never seen."""
+    from scipy import sparse
+
+    counts = sparse.csr_matrix(np.array([[0, 4.0, 0], [0, 1.0, 1.0], [0, 4.0, 0], [0, 0, 0]], np.float32))
+    means = np.array([[0, 0, 0], [0.1, 0, 0], [0.2, 0, 0], [0.1, 0.1, 0]], np.float32)
+    found = counting.refine(counts, means, np.full((4, 3), 0.5, np.float32), 2).toarray()
+    np.testing.assert_array_equal(found[[0, 2, 3]], counts.toarray()[[0, 2, 3]])
+    weight = np.exp(-0.5 * (0.1 / 0.5) ** 2)
+    np.testing.assert_allclose(found[1], [0, 1.0 + 0.5 * min(1.0, 2 * weight), 1.0], rtol=1e-5)
+
+
+def test_small_groups_are_dropped_and_the_others_numbered_by_size():
+    columns = np.array([[2], [2], [2], [1], [3], [3], [0], [-1]], np.int32)
+    shares, observations = np.ones((8, 1), np.float32), np.full(8, 9.0, np.float32)
+    found, kept = counting.drop_small(columns, shares, observations, 3, InstanceSettings(least_gaussians=2))
+    assert kept.tolist() == [1, 2]
+    assert found[:, 0].tolist() == [1, 1, 1, -1, 2, 2, 0, -1]
+
+
+@pytest.mark.parametrize("quat", [(1.0, 0, 0, 0), (0.8, 0.1, -0.5, 0.3), (0.1, -0.7, 0.7, 0.05)])
+def test_an_oriented_box_is_that_of_a_turned_cuboid(quat):
+    turn = rotation_matrices(torch.tensor([quat], dtype=torch.float64))[0].numpy()
+    local = np.random.default_rng(1).uniform(-1, 1, (40_000, 3)) * [3.0, 2.0, 1.0]
+    mean, axes, sides = oriented_box(local @ turn.T + [5.0, -2.0, 1.0], np.ones(len(local)))
+    np.testing.assert_allclose(mean, [5, -2, 1], atol=0.03)
+    np.testing.assert_allclose(sides, 0.96 * 2 * np.array([3.0, 2.0, 1.0]), rtol=0.02)
+    np.testing.assert_allclose(np.abs(axes.T @ turn), np.eye(3), atol=0.03)
+    back = rotation_matrices(torch.tensor([quaternion(axes)], dtype=torch.float64))[0].numpy()
+    np.testing.assert_allclose(back, axes, atol=1e-9)
+
+
+def test_agreement_in_closed_form():
+    """A Gaussian in four views, labels a, a, b, half a half b; pairs: aa 1, ab 0 (2), a-half 1/2 (2), b-half 1/2."""
+    sets = [[1, 0], [0, 1], [0, 0]]
+    views = [
+        hand_made([0], [0], [1.0], sets),
+        hand_made([0], [0], [5.0], sets),
+        hand_made([0], [1], [1.0], sets),
+        hand_made([0, 0], [0, 1], [2.0, 2.0], sets),
+        hand_made([0, 1], [2, 0], [1.0, 1.0], sets),  # no mask here, and a Gaussian that is seen once
+    ]
+    labels = [np.array([0, 1])] * 5
+    assert agreement(views, labels, 2) == pytest.approx((1 + 0.5 + 0.5 + 0.5) / 6)
+    assert np.isnan(agreement(views[:1], labels[:1], 2))
+
+
+def test_groups_by_name():
+    views = [hand_made([0], [0], [1.0], [[1, 0]], ["leg", "arm"]), hand_made([0], [0], [1.0], [[1]], ["arm"])]
+    groups, names = name_groups(views, "default")
+    assert groups.tolist() == [1, 0, 0]
+    assert names == ("arm", "leg")
+
+
+def test_view_evidence_is_small(stage):
+    """An id more costs nothing: only what is shown is stored."""
+    view: View = stage.views[0]
+    labels = stage.labels(view)
+    many = torch.stack([(labels == k % 5) & (torch.arange(labels.shape[1]) % 60 == k // 5) for k in range(300)])
+    found = ViewMasks.without_empty(many, torch.full((300,), -1))
+    evidence = view_evidence(stage.gaussians, view, found, RasterSettings())
+    assert len(evidence.gaussians) < 12 * len(stage.gaussians) < 300 * len(stage.gaussians)

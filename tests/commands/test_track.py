@@ -1,0 +1,202 @@
+"""`sgwarp track` on files in Dynamic3DGaussians' layout: what it writes, and that a killed run ends the same."""
+
+import json
+
+import numpy as np
+import pytest
+
+from sgwarp.apps.tracking import run as tracking_run
+from sgwarp.apps.tracking.state import read_features
+from sgwarp.cli import main
+from sgwarp.datasets.moving import LABELS, make_moving_scene
+from sgwarp.datasets.moving_files import save_moving_scene
+from sgwarp.files.images import read_ids, read_rgb
+from sgwarp.io.scenes import save_gaussians
+
+FRAMES = 6
+
+
+@pytest.fixture(scope="module")
+def files(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("moving")
+    scene = make_moving_scene(0, FRAMES, 2500, cameras=4, width=64, height=48, moving_share=0.5)
+    save_moving_scene(scene, folder, held_out=1, noise=0.1)
+    return folder
+
+
+def arguments(files, out, *more):
+    parts = ["track", files / "params.npz", "--views", files, "--encoder", f"files:{files / 'labels'}", "--out", out]
+    return [*map(str, parts), "--no-pictures", *more]
+
+
+@pytest.fixture(scope="module")
+def tracked(files, tmp_path_factory):
+    out = tmp_path_factory.mktemp("tracked") / "out"
+    assert main(arguments(files, out, "--features")) == 0
+    return out
+
+
+def written(folder):
+    """Content of everything that a run answers with."""
+    paths = [path for path in sorted(folder.rglob("*")) if path.is_file()]
+    return {str(p.relative_to(folder)): p.read_bytes() for p in paths if p.name not in ("run.json", "state.pt")}
+
+
+def test_masks_and_tracks(files, tracked):
+    good = total = 0
+    for frame in range(1, FRAMES):
+        for stem in ("0", "1", "2"):
+            found = read_ids(tracked / f"{frame:05d}" / f"{stem}.png")
+            truth = read_ids(files / "truth" / f"{frame:05d}" / f"{stem}.png")
+            good += int((found == truth).sum())
+            total += truth.size
+        assert not (tracked / f"{frame:05d}" / "3.png").exists()  # held out
+    assert good / total > 0.75
+    tracks = json.loads((tracked / "tracks.json").read_text())
+    assert tracks["frames"] == list(range(FRAMES))
+    assert tracks["views"] == ["0", "1", "2"]
+    ball = tracks["objects"][str(LABELS.index("ball") + 1)]
+    assert {len(values) for values in ball.values()} == {FRAMES}
+    assert ball["visible"][2]
+    seen = read_ids(tracked / "00002" / "1.png") == LABELS.index("ball") + 1
+    assert ball["pixels"][2]["1"] == int(seen.sum())
+    floor = tracks["objects"][str(LABELS.index("floor") + 1)]
+    assert np.abs(floor["centroid"]).max() < 0.4  # its middle is the origin; it reaches to 2.2
+    assert tracks["switches"][0] is None
+    assert len(tracks["left_out"]) == FRAMES
+
+
+def test_the_run_says_what_it_left_out(tracked):
+    run = json.loads((tracked / "run.json").read_text())
+    assert run["command"].startswith("sgwarp track")
+    assert {"lift", "encode", "fuse", "ask", "write"} <= set(run["stages"])
+    assert run["left_out"]["projections"] > 0
+    assert 0 < run["error"]["share_of_tiles_left_out"] < 1
+    assert str(tracked / "tracks.json") in run["outputs"]
+
+
+def test_pictures(files, tracked, tmp_path):
+    import cv2
+
+    assert not (tracked / "video.mp4").exists()
+    assert main([*arguments(files, tmp_path, "--frames", "3"), "--pictures"]) == 0
+    height, width = read_rgb(tmp_path / "overlays" / "00000.jpg").shape[:2]
+    sheet = read_rgb(tmp_path / "contact_sheet.jpg")
+    assert sheet.shape[0] >= 2 * height
+    assert sheet.shape[1] >= 2 * width
+    assert read_rgb(tmp_path / "trajectories.png").std() > 5
+    video = cv2.VideoCapture(str(tmp_path / "video.mp4"))
+    frames = 0
+    while video.read()[0]:
+        frames += 1
+    assert frames == 3
+
+
+def test_stored_features_are_those_of_the_frame(files, tracked):
+    """What was left out differs by less than a hundredth of a row's length, and is less than everything."""
+    import torch
+
+    from sgwarp.apps.tracking.sources import LabelFrames
+    from sgwarp.apps.tracking.tracker import track
+    from sgwarp.io.moving_views import load_moving_views
+    from sgwarp.io.sequences import load_sequence
+
+    for one in track(load_sequence(files), load_moving_views(files), LabelFrames(files / "labels")):
+        stored = torch.from_numpy(read_features(tracked / "features", one.index)).float()
+        wanted = torch.where(one.weight[:, None] > 0, one.features, 0.0)
+        assert float((stored - wanted).abs().max()) <= 0.011
+    run = json.loads((tracked / "run.json").read_text())
+    assert run["left_out"]["stored_features_that_did_not_change"] > 0
+
+
+@pytest.mark.parametrize("after", [1, 4])
+def test_a_killed_run_goes_on_to_the_same_bytes(files, tracked, tmp_path, monkeypatch, after):
+    out, write = tmp_path / "out", tracking_run._write
+    monkeypatch.setattr(tracking_run.Output, "every", 2)
+
+    def dies(output, one, *rest):
+        if one.index == after:
+            raise SystemExit(9)
+        write(output, one, *rest)
+
+    monkeypatch.setattr(tracking_run, "_write", dies)
+    with pytest.raises(SystemExit):
+        main(arguments(files, out, "--features"))
+    assert not (out / "tracks.json").exists()
+    monkeypatch.setattr(tracking_run, "_write", write)
+    assert main(arguments(files, out, "--features", "--resume")) == 0
+    assert written(out) == written(tracked)
+
+
+def test_resume_needs_the_same_options(files, tracked, capsys):
+    assert main(arguments(files, tracked, "--features", "--resume", "--forgetting", "0.5")) == 2
+    assert "had forgetting 0.9, now 0.5" in capsys.readouterr().err
+
+
+def test_incremental_or_not_is_the_same(files, tracked, tmp_path):
+    assert main(arguments(files, tmp_path, "--features", "--no-incremental")) == 0
+    mine = {name: data for name, data in written(tmp_path).items() if name.endswith((".png", ".npz"))}
+    theirs = {name: data for name, data in written(tracked).items() if name.endswith((".png", ".npz"))}
+    assert mine == theirs
+
+
+def test_every_frame_alone_differs_from_fused(files, tracked, tmp_path):
+    assert main(arguments(files, tmp_path, "--forgetting", "0")) == 0
+    assert (tmp_path / "00000" / "1.png").read_bytes() == (tracked / "00000" / "1.png").read_bytes()
+    assert (tmp_path / "00003" / "1.png").read_bytes() != (tracked / "00003" / "1.png").read_bytes()
+
+
+def test_masks_of_cameras_that_were_not_lifted(files, tmp_path):
+    assert main(arguments(files, tmp_path, "--mask-views", str(files), "--frames", "3")) == 0
+    assert sorted(path.name for path in (tmp_path / "00002").iterdir()) == ["3.png", "frame.json"]
+    truth = read_ids(files / "truth" / "00002" / "3.png")
+    assert float((read_ids(tmp_path / "00002" / "3.png") == truth).mean()) > 0.7
+    assert not (tmp_path / "00003").exists()
+
+
+def test_a_folder_of_ply_with_cameras_that_stay(files, tmp_path):
+    scene = make_moving_scene(0, FRAMES, 2500, cameras=4, width=64, height=48, moving_share=0.5)
+    (tmp_path / "ply").mkdir()
+    frames = []
+    for index in range(3):
+        save_gaussians(scene.gaussians(index), tmp_path / "ply" / f"{index}.ply")
+    for view in scene.cameras[:3]:
+        to_world = np.linalg.inv(view.camera.world_to_camera.numpy()) @ np.diag([1.0, -1, -1, 1])
+        K = view.camera.K
+        lens = {"fl_x": float(K[0, 0]), "fl_y": float(K[1, 1]), "cx": float(K[0, 2]), "cy": float(K[1, 2])}
+        frames.append({"file_path": f"{view.stem}.png", "transform_matrix": to_world.tolist(), **lens})
+    (tmp_path / "transforms.json").write_text(json.dumps({"w": 64, "h": 48, "frames": frames}))
+    parts = ["track", tmp_path / "ply", "--views", tmp_path, "--encoder", f"files:{files / 'truth'}"]
+    assert main([*map(str, parts), "--out", str(tmp_path / "out")]) == 0
+    truth = read_ids(files / "truth" / "00002" / "1.png")
+    assert float((read_ids(tmp_path / "out" / "00002" / "1.png") == truth).mean()) > 0.8
+
+
+def test_info_of_a_sequence(files, capsys):
+    assert main(["info", str(files / "params.npz"), "--json"]) == 0
+    facts = json.loads(capsys.readouterr().out)
+    assert (facts["frames"], facts["gaussians"], facts["identity"]) == (FRAMES, 2500, "rows")
+    assert facts["foreground_share"] == pytest.approx(0.5, abs=0.01)
+    assert facts["moving_share"] == pytest.approx(0.5, abs=0.01)
+    assert facts["largest_step"] > facts["median_step"] > 0
+
+
+@pytest.mark.parametrize(
+    ("more", "message"),
+    [
+        (["--forgetting", "1.5"], "forgetting: expected 0 to 1"),
+        (["--frames", "99"], "frames: 99 are asked for"),
+        (["--unknown-below", "2"], "--unknown-below"),
+        (["--associate", "--resume"], "--associate: keeps no state"),
+        (["--encoder", "files:nowhere"], "nowhere: no such folder"),
+        (["--text", "open"], "texts: need features in a text space"),
+    ],
+)
+def test_bad_input_is_one_line_and_code_2(files, tmp_path, capsys, more, message):
+    out = tmp_path / "out"
+    assert main(arguments(files, out, *more)) == 2
+    error = capsys.readouterr().err.strip().splitlines()
+    assert len(error) == 1
+    assert message in error[0]
+    assert not (out / "tracks.json").exists()
+    assert not (out / "run.json").exists()

@@ -1,0 +1,149 @@
+"""Captures as people have them: any unit and origin, masks that hide all, photographs of nothing, large ones."""
+
+import json
+import shutil
+from dataclasses import replace
+
+import cv2
+import numpy as np
+import pytest
+import torch
+
+from sgwarp.cli import main
+from sgwarp.errors import InputError
+from sgwarp.io.points import load_points
+from sgwarp.reconstruction.fitting.coverage import in_view, seen_by_any
+from sgwarp.reconstruction.fitting.frame import Frame
+from sgwarp.reconstruction.fitting.initial import random_points
+from sgwarp.reconstruction.fitting.photographs import read_photographs, require_overlap
+from sgwarp.reconstruction.fitting.pixels import PixelStore
+from sgwarp.reconstruction.fitting.settings import FitSettings
+from sgwarp.reconstruction.fitting.trainer import fit
+from sgwarp.scene import Gaussians
+
+
+def moved(view, scale, shift):
+    pose = view.camera.world_to_camera.clone()
+    pose[:3, 3] = scale * pose[:3, 3] - pose[:3, :3] @ shift
+    return replace(view, camera=replace(view.camera, world_to_camera=pose))
+
+
+@pytest.fixture(scope="module")
+def plain(boards):
+    return fit(boards.views[1:], load_points(boards.folder), boards.views[:1], SETTINGS)
+
+
+SETTINGS = FitSettings(steps=25, cap=600, sh_degree=0, evaluate_every=25)
+
+
+@pytest.mark.parametrize(("scale", "offset"), [(1e-3, 0.0), (1e6, 0.0), (1.0, 5e6)])
+def test_unit_and_origin_make_no_difference(boards, plain, scale, offset):
+    shift = torch.tensor([offset, -offset, offset], dtype=torch.float64)
+    views = [moved(view, scale, shift) for view in boards.views]
+    positions = load_points(boards.folder)[0] * scale + shift.numpy()
+    other = fit(views[1:], (positions, load_points(boards.folder)[1]), views[:1], SETTINGS)
+    assert other.curve[-1].psnr == pytest.approx(plain.curve[-1].psnr, abs=0.3)
+    if offset == 0:
+        torch.testing.assert_close(
+            other.gaussians.scales.median() / scale, plain.gaussians.scales.median(), rtol=0.1, atol=0
+        )
+
+
+def test_a_frame_goes_back_to_the_world(boards):
+    frame = Frame.around(boards.views)
+    random = torch.Generator().manual_seed(0)
+    means = torch.randn(9, 3, generator=random)
+    scene = Gaussians(
+        means, torch.eye(4)[:1].expand(9, 4), torch.rand(9, 3, generator=random), torch.ones(9), torch.zeros(9, 1, 3)
+    )
+    back = frame.restored(frame.gaussians(scene))
+    torch.testing.assert_close(back.means, scene.means)
+    torch.testing.assert_close(back.scales, scene.scales)
+    camera, inner = boards.views[0].camera, frame.camera(boards.views[0].camera)
+    pixel, same = (
+        c.K @ (c.world_to_camera[:3] @ torch.cat([p, torch.ones(1)]).double())
+        for c, p in ((camera, means[0].double()), (inner, frame.points(means[:1])[0]))
+    )
+    torch.testing.assert_close(pixel[:2] / pixel[2], same[:2] / same[2])
+
+
+def test_a_mask_that_hides_all_costs_its_photograph(boards, caplog):
+    masks = {view.stem: np.full(view.camera.size, view.stem != "0003") for view in boards.views}
+    photographs = read_photographs(boards.views, masks=lambda view: masks[view.stem])
+    assert [p.stem for p in photographs] == [v.stem for v in boards.views if v.stem != "0003"]
+    assert "left out 1 photographs whose mask leaves no pixel, first 0003" in caplog.text
+
+
+def test_photographs_that_show_no_points_cost_a_notice(boards, caplog):
+    photographs = read_photographs(boards.views)
+    camera = photographs[0].camera
+    turn = torch.diag(torch.tensor([-1.0, 1.0, -1.0, 1.0], dtype=torch.float64))
+    photographs[0] = replace(photographs[0], camera=replace(camera, world_to_camera=turn @ camera.world_to_camera))
+    points = torch.from_numpy(load_points(boards.folder)[0]).float()
+    require_overlap(photographs, points)
+    assert f"1 of {len(photographs)} photographs show none of the" in caplog.text
+    with pytest.raises(InputError, match=r"nor does any other.*--init random"):
+        require_overlap(photographs[:1], points)
+
+
+def test_large_photographs_are_scaled_down_with_a_notice(boards, caplog):
+    (small,) = read_photographs(boards.views[:1], largest=32)
+    assert small.camera.size == (24, 32)
+    assert small.pixels.shape == (24, 32, 3)
+    assert "1 photographs are scaled down to 32 pixels (the first is 64 x 48); --max-size" in caplog.text
+
+
+def test_photographs_beyond_the_memory_are_read_from_a_file():
+    random = np.random.default_rng(0)
+    images = [random.integers(0, 256, (5, 7, 3), np.uint8) for _ in range(4)]
+    store = PixelStore(in_memory=2 * 5 * 7 * 3)
+    kept = [store.put(image) for image in images]
+    assert [isinstance(pixels, torch.Tensor) for pixels in kept] == [True, True, False, False]
+    for pixels, image in zip(kept[2:], images[2:], strict=True):
+        assert np.array_equal(pixels.read().numpy(), image)
+        assert np.array_equal(pixels.read().numpy(), image)
+
+
+def test_random_points_lie_on_surfaces_where_photographs_agree(boards):
+    frame = Frame.around(boards.views)
+    positions, _, _ = random_points(read_photographs([*map(frame.view, boards.views)]), FitSettings(cap=4000))
+    depth = (positions * frame.scale + frame.origin)[:, 2]
+    off = torch.stack([(depth - z).abs() for z in (4.0, 3.0, 2.6)]).amin(dim=0)
+    assert off.median() < 0.15
+
+
+def test_gaussians_that_no_camera_sees_are_removed(boards):
+    camera = boards.views[2].camera
+    front = camera.world_to_camera.inverse()
+    places = torch.stack(
+        [
+            (front @ torch.tensor([x, 0, z, 1.0], dtype=torch.float64))[:3]
+            for x, z in ((0, 2), (9, 2), (0, -2), (2.0, 2))
+        ]
+    )
+    assert in_view(camera, places).tolist() == [True, False, False, False]
+    scene = Gaussians(
+        places.float(), torch.eye(4)[:1].expand(4, 4), torch.full((4, 3), 0.4), torch.ones(4), torch.zeros(4, 1, 3)
+    )
+    assert seen_by_any(scene, [camera]).tolist() == [True, False, False, True]
+
+
+def test_overfitting_is_measured_and_warned_of(boards, tmp_path, capsys, monkeypatch):
+    monkeypatch.setattr("sgwarp.commands.fit.LARGEST_GAP", -50.0)
+    out = tmp_path / "scene.ply"
+    assert main(["fit", str(boards.folder), "--out", str(out), "--steps", "3", "--cap", "300"]) == 0
+    error = json.loads((tmp_path / "run.json").read_text())["error"]
+    assert error["overfitting_gap"] == pytest.approx(error["fitted_psnr"] - error["held_out_psnr"])
+    said = capsys.readouterr().err
+    assert "overfitted:" in said
+    assert "cameras: 7 photographs of 64 x 48" in said
+    assert "points: " in said
+
+
+def test_without_points_and_features_a_fit_starts_at_random_and_says_so(boards, tmp_path, capsys):
+    shutil.copytree(boards.folder, tmp_path / "stage")
+    (tmp_path / "stage/points3D.ply").unlink()
+    out = tmp_path / "scene.ply"
+    assert main(["fit", str(tmp_path / "stage"), "--out", str(out), "--steps", "2", "--cap", "300"]) == 0
+    assert "starts at random" in capsys.readouterr().err
+    assert cv2.imread(str(tmp_path / "scene.held_out.jpg")) is not None

@@ -1,0 +1,125 @@
+"""Structure from motion through pycolmap, against cameras and surfaces that are known."""
+
+import json
+import shutil
+from dataclasses import replace
+
+import cv2
+import numpy as np
+import pytest
+import torch
+
+from sgwarp.cli import main
+from sgwarp.errors import InputError
+from sgwarp.files.images import write_rgb
+from sgwarp.io.points import load_points
+from sgwarp.io.views import load_views
+from sgwarp.io.world import similarity_between
+from sgwarp.reconstruction.sfm.poses import estimate_poses
+from sgwarp.reconstruction.sfm.triangulation import triangulate
+from sgwarp.reconstruction.sfm.video import extract_frames
+
+pytest.importorskip("pycolmap")
+
+
+@pytest.fixture(scope="module")
+def found(corner, tmp_path_factory):
+    """What structure from motion makes of the corner and one photograph that shows nothing."""
+    folder = tmp_path_factory.mktemp("photos")
+    for path in corner[0].glob("*.png"):
+        shutil.copy(path, folder)
+    write_rgb(folder / "blank.png", np.full((192, 256, 3), 0.5))
+    out = tmp_path_factory.mktemp("sfm")
+    return folder, out, estimate_poses(folder, out)
+
+
+def test_poses_are_those_of_the_cameras_up_to_a_similarity(corner, found):
+    _, out, registration = found
+    assert len(registration.registered) == 8
+    assert registration.error < 1
+    views = load_views(out)
+    assert [view.stem for view in views] == [view.stem for view in corner[1]]
+    ours, truth = (np.stack([v.camera.position.numpy() for v in group]) for group in (views, corner[1]))
+    matrix = similarity_between(ours, truth)
+    assert np.linalg.norm(ours @ matrix[:3, :3].T + matrix[:3, 3] - truth, axis=1).max() < 0.05
+    x, _, z = (load_points(out)[0] @ matrix[:3, :3].T + matrix[:3, 3]).T
+    assert np.median(np.abs(z - 3 - np.abs(x))) < 0.03
+
+
+def test_a_photograph_without_pose_is_named_with_the_reason(found):
+    _, out, registration = found
+    assert registration.left_out == {"blank.png": "only 0 features: blurred, dark, or of something even"}
+    assert "8 of 9 photographs have poses" in registration.summary()
+    assert json.loads((out / "sfm.json").read_text())["left_out"] == registration.left_out
+    assert not (out / "database.db").exists()
+
+
+def test_a_model_of_the_same_photographs_is_kept(found):
+    folder, out, registration = found
+    before = (out / "sparse/0/points3D.bin").stat().st_mtime_ns
+    assert estimate_poses(folder, out) == registration
+    assert (out / "sparse/0/points3D.bin").stat().st_mtime_ns == before
+
+
+def test_too_few_photographs_are_refused(tmp_path, capsys):
+    write_rgb(tmp_path / "a.png", np.zeros((8, 8, 3)))
+    assert main(["poses", str(tmp_path), "--out", str(tmp_path / "out")]) == 2
+    assert "holds 1 photographs; structure from motion needs at least 3" in capsys.readouterr().err
+
+
+def test_photographs_that_do_not_overlap_are_refused(tmp_path):
+    for index in range(3):
+        write_rgb(tmp_path / "in" / f"{index}.png", np.random.default_rng(index).random((96, 128, 3)))
+    with pytest.raises(InputError, match="no two photographs overlap enough to place them"):
+        estimate_poses(tmp_path / "in", tmp_path / "out")
+
+
+def test_points_are_triangulated_with_the_given_poses_far_from_the_origin(corner):
+    shift = torch.tensor([5e6, 0.0, 5e6], dtype=torch.float64)
+    views = []
+    for view in corner[1]:
+        pose = view.camera.world_to_camera.clone()
+        pose[:3, 3] -= pose[:3, :3] @ shift
+        views.append(replace(view, camera=replace(view.camera, world_to_camera=pose)))
+    positions, colors = triangulate(views)
+    x, _, z = (positions - shift.numpy()).T
+    assert len(positions) > 300
+    assert np.median(np.abs(z - 3 - np.abs(x))) < 0.01
+    assert colors.min() >= 0
+    assert colors.std() > 0.05
+
+
+def test_wrong_poses_leave_hardly_any_points(corner):
+    order = (3, 0, 6, 1, 7, 4, 2, 5)
+    wrong = [replace(view, camera=corner[1][other].camera) for view, other in zip(corner[1], order, strict=True)]
+    assert len(triangulate(wrong)[0]) < 50
+
+
+def test_the_sharpest_of_every_few_frames_is_kept(corner, tmp_path):
+    video = tmp_path / "walk.avi"
+    writer = cv2.VideoWriter(str(video), cv2.VideoWriter_fourcc(*"MJPG"), 10, (256, 192))
+    assert writer.isOpened()
+    for view in corner[1]:
+        frame = cv2.imread(str(view.image_path))
+        for blurred in (True, False, True):
+            writer.write(cv2.GaussianBlur(frame, (15, 15), 5) if blurred else frame)
+    writer.release()
+    assert extract_frames(video, tmp_path / "frames", every=3) == 8
+    for view in corner[1]:
+        kept = cv2.imread(str(tmp_path / "frames" / f"{int(view.stem):05d}.jpg")).astype(float)
+        assert np.abs(kept - cv2.imread(str(view.image_path))).mean() < 8
+    (tmp_path / "no.mp4").write_bytes(b"no video")
+    with pytest.raises(InputError, match=r"no\.mp4: 0 frames can be read"):
+        extract_frames(tmp_path / "no.mp4", tmp_path / "none")
+    assert not (tmp_path / "none").exists()
+
+
+def test_photographs_become_a_scene_in_one_command(found, tmp_path, capsys):
+    folder, made, _ = found
+    shutil.copytree(made, tmp_path / "scene.ply.sfm", symlinks=True)
+    out = tmp_path / "scene.ply"
+    assert main(["fit", str(folder), "--out", str(out), "--steps", "2", "--cap", "800", "--downscale", "2"]) == 0
+    log = json.loads((tmp_path / "run.json").read_text())
+    assert {"held_out_psnr", "fitted_psnr", "overfitting_gap", "reprojection_error"} <= set(log["error"])
+    assert (tmp_path / "scene.ply.sfm/sparse/0/images.bin").is_file()
+    assert "8 of 9 photographs have poses" in capsys.readouterr().err

@@ -1,0 +1,37 @@
+"""Depth where photographs agree, against surfaces that are known."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from sgwarp.reconstruction.stereo import estimate_depth
+
+
+@pytest.mark.parametrize("unit", [1.0, 1e-3])
+def test_depth_is_that_of_the_surface_in_any_unit(shots, unit):
+    cameras = []
+    for camera, _, _ in shots:
+        pose = camera.world_to_camera.clone()
+        pose[:3, 3] *= unit
+        cameras.append(replace(camera, world_to_camera=pose))
+    maps = estimate_depth([image for _, image, _ in shots], cameras, 1.4 * unit)
+    for found, (_, _, depth) in zip(maps, shots, strict=True):
+        sizes = zip(depth.shape, found.depth.shape, strict=True)
+        rows, columns = (np.linspace(0, large - 1, small).round().astype(int) for large, small in sizes)
+        error = np.abs(found.depth / (unit * depth[np.ix_(rows, columns)]) - 1)
+        assert found.known.mean() > 0.6
+        assert np.median(error[found.known]) < 0.02
+
+
+def test_nothing_is_known_where_photographs_do_not_agree(shots):
+    random = np.random.default_rng(0)
+    noise = [random.random(image.shape).astype(np.float32) for _, image, _ in shots]
+    maps = estimate_depth(noise, [camera for camera, _, _ in shots], 1.4)
+    assert np.mean([found.known.mean() for found in maps]) < 0.2
+
+
+def test_one_photograph_alone_tells_nothing(shots):
+    camera, image, _ = shots[0]
+    (found,) = estimate_depth([image], [camera], 1.0)
+    assert not found.known.any()
