@@ -38,7 +38,7 @@ class LeftOut:
         log, own = logging.getLogger("sgwarp"), [reason for reason in self._names if reason.startswith("(")]
         for reason, names in self._names.items():
             if reason not in own:
-                log.warning("%s: left out %d %s %s, first %s", self.source, len(names), self.unit, reason, names[0])
+                log.warning("%s: left out %d %s %s, first %r", self.source, len(names), self.unit, reason, names[0])
         if own:
             count = sum(len(self._names[reason]) for reason in own)
             log.warning(
