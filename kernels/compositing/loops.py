@@ -167,7 +167,7 @@ BACKWARD = """
     *reinterpret_cast<Row*>(middle_of) = middles, *reinterpret_cast<Row*>(top_of) = tops;
     const float above = y0, y = s.mean[1] - above - 0.5f;
     const int middle_row = (__builtin_ctz(left) + 31 - __builtin_clz(left)) / 2;
-#if WIDE
+#if SGWARP_WIDE
     Row weights[16] __attribute__((aligned(64)));
     VALUES
 #endif
@@ -182,7 +182,7 @@ BACKWARD = """
         const Row T = row_state[0] * reciprocal(__builtin_elementwise_max(one - alpha, one * MIN_PASSED));
         const Row w = alpha * T;
         Row value = zero;
-#if WIDE
+#if SGWARP_WIDE
         value = values[row];
         weights[row] = w;
 #else
@@ -233,7 +233,7 @@ BACKWARD = """
     const Row q0 = FOLD_4(p0, p1), q1 = FOLD_4(p2, p3), q2 = FOLD_4(p4, p5);
     const Row r0 = FOLD_2(q0, q1), r1 = FOLD_2(q2, zero);
     *reinterpret_cast<Row*>(rows.data + place) = FOLD_1(r0, r1);
-#if WIDE
+#if SGWARP_WIDE
     FEATURES
 #endif
 """.replace("    VALUES\n", VALUES).replace("    FEATURES\n", FEATURES)
@@ -302,7 +302,10 @@ def fragment_replay(wide: bool, depth: bool, absolute: bool, min_passed: float) 
     """Device function that differentiates one fragment of a tile and steps the tile's state to the front of it."""
     constants = {"WIDE": wide, "DEPTH": depth, "ABSOLUTE": absolute, "MIN_PASSED": float(min_passed)}
 
-    @wp.func_native(snippet(BACKWARD, **constants))
+    # The preprocessor does not see constants of C++, and without features there is nothing to take 16 of.
+    switch = f"\n#define SGWARP_WIDE {int(wide)}\n"
+
+    @wp.func_native(f"{switch}{snippet(BACKWARD, **constants)}\n#undef SGWARP_WIDE\n")
     def replay_fragment(
         slot: int,
         rank: int,  # of the splat

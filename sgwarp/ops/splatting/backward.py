@@ -155,9 +155,7 @@ def composite_backward(
         inputs = [*lists.sums(), view(rows, Lanes)]
         launch(kernels.sum_intersections, len(lists.order), inputs, [view(sums, Lanes)], device=device)
     if gradients.surface is not None and count:
-        # Pixels without a surface add zero to the first Gaussian: choosing the others would wait for the device.
-        at_hit = torch.where(hit >= 0, gradients.surface, 0.0).flatten()
-        sums[:, at_depth].index_add_(0, hit.clamp(min=0).flatten().to(torch.int64), at_hit)
+        _add_at_surface(sums[:, at_depth], hit.flatten(), gradients.surface.flatten(), ordered)
     if not wide:
         v_features = sums[:, MOMENTS : MOMENTS + channels]
     elif together:
@@ -170,6 +168,23 @@ def composite_backward(
     # The kernel leaves out the factor of d(2^x) = ln 2 2^x dx, and that of the square.
     magnitudes = 2.0 * kernels.LN_2 * sums[:, at_absolute : at_absolute + 2] if absolute else None
     return SplatGradients(sums, at_depth if depth else -1, v_features, magnitudes)
+
+
+def _add_at_surface(column: Tensor, hit: Tensor, gradient: Tensor, ordered: bool) -> None:
+    """Add each pixel's gradient of the surface depth to the Gaussian that gave it.
+
+    Pixels without a surface add zero, to some Gaussian: to leave them out would be to wait for the device.
+    """
+    gradient = torch.where(hit >= 0, gradient, 0.0)
+    if not hit.is_cuda:
+        column.index_add_(0, hit.clamp(min=0).to(torch.int64), gradient)
+        return
+    anywhere = torch.arange(len(hit), device=hit.device) % len(column)  # one for all would be added to in turn
+    rows = torch.where(hit >= 0, hit, anywhere).to(torch.int64)
+    if ordered:  # index_add_ is atomic on CUDA, this sorts
+        column.index_put_((rows,), gradient, accumulate=True)
+    else:
+        column.index_add_(0, rows, gradient)
 
 
 def _in_lanes(image: Tensor, outside: float) -> Tensor:
