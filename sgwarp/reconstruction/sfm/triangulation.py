@@ -13,8 +13,14 @@ from numpy.typing import NDArray
 
 from sgwarp.files.images import write_rgb
 from sgwarp.reconstruction.fitting.frame import Frame
-from sgwarp.reconstruction.sfm.features import LARGEST, SfmSettings
-from sgwarp.reconstruction.sfm.library import count_rows, require_pycolmap, run_cancellable
+from sgwarp.reconstruction.sfm.features import (
+    LARGEST,
+    PHOTOGRAPHS_AT_ONCE,
+    SfmSettings,
+    match_features,
+    store_features,
+)
+from sgwarp.reconstruction.sfm.library import require_pycolmap, run_cancellable
 from sgwarp.runs.progress import Report
 from sgwarp.scene import Camera, View
 
@@ -99,45 +105,18 @@ class _Model:
             data.write_camera(lens, use_camera_id=True)
             self.lenses[number] = lens
         data.close()
-        options = library.FeatureExtractionOptions()
-        options.num_threads, options.use_gpu = self.settings.threads, False
+        done = 0
         for number, names in enumerate(groups.values(), start=1):
-            reader = library.ImageReaderOptions()
-            reader.existing_camera_id = number
-
-            def extract(token: Any, names: list[str] = names, reader: Any = reader) -> None:
-                library.extract_features(
-                    self.database,
-                    self.folder,
-                    image_names=names,
-                    reader_options=reader,
-                    extraction_options=options,
-                    device=library.Device.cpu,
-                    cancellation_token=token,
-                )
-
-            run_cancellable(extract, self._watch("keypoints", len(self.names), "finding features"))
+            for start in range(0, len(names), PHOTOGRAPHS_AT_ONCE):
+                self.report(done, len(self.names), "finding features")
+                chunk = names[start : start + PHOTOGRAPHS_AT_ONCE]
+                store_features(self.database, self.folder, chunk, self.settings, number)
+                done += len(chunk)
 
     def match(self) -> None:
         """Match each photograph with those near it that look about the same way."""
-        pairs = sorted(_pairs(self.cameras))
-        listed = self.folder / "pairs.txt"
-        listed.write_text("".join(f"{self.names[a]} {self.names[b]}\n" for a, b in pairs), encoding="utf-8")
-        options = self.library.FeatureMatchingOptions()
-        options.num_threads, options.use_gpu = self.settings.threads, False
-        pairing = self.library.ImportedPairingOptions()
-        pairing.match_list_path = listed
-
-        def match(token: Any) -> None:
-            self.library.match_image_pairs(
-                self.database,
-                matching_options=options,
-                pairing_options=pairing,
-                device=self.library.Device.cpu,
-                cancellation_token=token,
-            )
-
-        run_cancellable(match, self._watch("two_view_geometries", len(pairs), "matching photographs"))
+        pairs = [(self.names[a], self.names[b]) for a, b in sorted(_pairs(self.cameras))]
+        match_features(self.database, pairs, self.settings, self.report)
 
     def triangulate(self) -> Any:
         """The reconstruction with the given poses and all points."""
@@ -163,9 +142,6 @@ class _Model:
             )
 
         return run_cancellable(run, lambda: self.report(0, 1, "triangulating"))
-
-    def _watch(self, table: str, total: int, text: str) -> Any:
-        return lambda: self.report(min(count_rows(self.database, table), total), total, text)
 
 
 def _pairs(cameras: Sequence[Camera]) -> set[tuple[int, int]]:
