@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 import tempfile
 from collections import defaultdict
 from collections.abc import Sequence
@@ -24,8 +25,11 @@ from sgwarp.reconstruction.sfm.library import require_pycolmap, run_cancellable
 from sgwarp.runs.progress import Report
 from sgwarp.scene import Camera, View
 
+logger = logging.getLogger("sgwarp")
 NEIGHBORS = 20  # photographs that each is matched with
 LEAST_POINTS = 50  # that are worth starting from
+LEAST_TRACK = 3  # photographs that see a point
+LEAST_SHARE = 0.6  # of the points, that so many see
 LEAST_COSINE = 0.3  # between the directions of view of two that are matched
 
 Points = tuple[NDArray[np.float64], NDArray[np.float32]]
@@ -59,10 +63,21 @@ def triangulate(views: Sequence[View], settings: SfmSettings | None = None, prog
         model.extract()
         model.match()
         found = model.triangulate()
-        points = list(found.points3D.values())
+        points = _consistent(list(found.points3D.values()))
         positions = np.array([point.xyz for point in points]).reshape(-1, 3)
         colors = np.array([point.color for point in points]).reshape(-1, 3)
     return positions * frame.scale + frame.origin.numpy(), colors.astype(np.float32) / np.float32(255)
+
+
+def _consistent(points: list[Any]) -> list[Any]:
+    """Points that at least three photographs agree on; none if most lost their third, as those of wrong poses do."""
+    kept = [point for point in points if point.track.length() >= LEAST_TRACK]
+    if len(kept) < LEAST_SHARE * len(points):
+        logger.warning(
+            "the poses contradict the photographs: of %d points only %d fit three of them", len(points), len(kept)
+        )
+        return []
+    return kept
 
 
 def _store(view: View, folder: Path, name: str) -> Camera:

@@ -89,6 +89,13 @@ def test_points_are_triangulated_with_the_given_poses_far_from_the_origin(corner
     assert colors.std() > 0.05
 
 
+def test_wrong_poses_leave_no_points_and_are_named(corner, caplog):
+    order = (3, 0, 6, 1, 7, 4, 2, 5)
+    wrong = [replace(view, camera=corner[1][other].camera) for view, other in zip(corner[1], order, strict=True)]
+    assert len(triangulate(wrong)[0]) == 0
+    assert "the poses contradict the photographs" in caplog.text
+
+
 def test_the_sharpest_of_every_few_frames_is_kept(corner, tmp_path):
     video = tmp_path / "walk.avi"
     writer = cv2.VideoWriter(str(video), cv2.VideoWriter_fourcc(*"MJPG"), 10, (256, 192))
