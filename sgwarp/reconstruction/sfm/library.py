@@ -2,10 +2,8 @@
 
 from __future__ import annotations
 
-import sqlite3
 import threading
 from collections.abc import Callable
-from pathlib import Path
 from typing import Any
 
 from sgwarp.errors import InputError
@@ -39,6 +37,9 @@ def has_pycolmap() -> bool:
 def run_cancellable(call: Callable[[Any], Any], watch: Callable[[], None] | None = None) -> Any:
     """Run a long call of the library in a thread.
 
+    Nothing else in this process may open the database meanwhile: the library brings its own SQLite, and closing the
+    file in one copy of SQLite drops the locks of the other.
+
     Args:
         call: Takes the token by which it is canceled.
         watch: Called four times a second meanwhile, to report progress.
@@ -71,17 +72,3 @@ def run_cancellable(call: Callable[[Any], Any], watch: Callable[[], None] | None
     if failure:
         raise failure[0]
     return outcome[0]
-
-
-def count_rows(database: Path, table: str) -> int:
-    """Rows of a table of a COLMAP database that another thread may be writing to; 0 where it cannot be read now."""
-    if not database.is_file():
-        return 0
-    try:
-        connection = sqlite3.connect(f"file:{database}?mode=ro", uri=True, timeout=POLL)
-        try:
-            return int(connection.execute(f"SELECT COUNT(*) FROM {table}").fetchone()[0])
-        finally:
-            connection.close()
-    except sqlite3.Error:
-        return 0

@@ -16,7 +16,13 @@ from sgwarp.errors import InputError
 from sgwarp.files.access import reading
 from sgwarp.files.atomic import atomic_path
 from sgwarp.io.stems import IMAGE_SUFFIXES
-from sgwarp.reconstruction.sfm.features import SfmSettings, extract_features, match_features, require_photographs
+from sgwarp.reconstruction.sfm.features import (
+    SfmSettings,
+    choose_pairs,
+    extract_features,
+    match_features,
+    require_photographs,
+)
 from sgwarp.reconstruction.sfm.library import require_pycolmap, run_cancellable
 from sgwarp.runs.progress import Report
 
@@ -96,7 +102,7 @@ def estimate_poses(
     pycolmap.set_random_seed(settings.seed)
     readable = [name for name in names if _readable(folder / name)]
     extract_features(database, folder, readable, settings, report)
-    match_features(database, len(readable), settings, report)
+    match_features(database, choose_pairs(readable, settings.matching), settings, report)
     model = _map(database, folder, out, settings, len(readable), report)
     found = Registration(
         tuple(sorted(model.image(number).name for number in model.reg_image_ids())),

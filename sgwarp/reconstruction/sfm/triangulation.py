@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 import tempfile
 from collections import defaultdict
 from collections.abc import Sequence
@@ -13,13 +14,22 @@ from numpy.typing import NDArray
 
 from sgwarp.files.images import write_rgb
 from sgwarp.reconstruction.fitting.frame import Frame
-from sgwarp.reconstruction.sfm.features import LARGEST, SfmSettings
-from sgwarp.reconstruction.sfm.library import count_rows, require_pycolmap, run_cancellable
+from sgwarp.reconstruction.sfm.features import (
+    LARGEST,
+    PHOTOGRAPHS_AT_ONCE,
+    SfmSettings,
+    match_features,
+    store_features,
+)
+from sgwarp.reconstruction.sfm.library import require_pycolmap, run_cancellable
 from sgwarp.runs.progress import Report
 from sgwarp.scene import Camera, View
 
+logger = logging.getLogger("sgwarp")
 NEIGHBORS = 20  # photographs that each is matched with
 LEAST_POINTS = 50  # that are worth starting from
+LEAST_TRACK = 3  # photographs that see a point
+LEAST_SHARE = 0.6  # of the points, that so many see
 LEAST_COSINE = 0.3  # between the directions of view of two that are matched
 
 Points = tuple[NDArray[np.float64], NDArray[np.float32]]
@@ -53,10 +63,21 @@ def triangulate(views: Sequence[View], settings: SfmSettings | None = None, prog
         model.extract()
         model.match()
         found = model.triangulate()
-        points = list(found.points3D.values())
+        points = _consistent(list(found.points3D.values()))
         positions = np.array([point.xyz for point in points]).reshape(-1, 3)
         colors = np.array([point.color for point in points]).reshape(-1, 3)
     return positions * frame.scale + frame.origin.numpy(), colors.astype(np.float32) / np.float32(255)
+
+
+def _consistent(points: list[Any]) -> list[Any]:
+    """Points that at least three photographs agree on; none if most lost their third, as those of wrong poses do."""
+    kept = [point for point in points if point.track.length() >= LEAST_TRACK]
+    if len(kept) < LEAST_SHARE * len(points):
+        logger.warning(
+            "the poses contradict the photographs: of %d points only %d fit three of them", len(points), len(kept)
+        )
+        return []
+    return kept
 
 
 def _store(view: View, folder: Path, name: str) -> Camera:
@@ -99,45 +120,18 @@ class _Model:
             data.write_camera(lens, use_camera_id=True)
             self.lenses[number] = lens
         data.close()
-        options = library.FeatureExtractionOptions()
-        options.num_threads, options.use_gpu = self.settings.threads, False
+        done = 0
         for number, names in enumerate(groups.values(), start=1):
-            reader = library.ImageReaderOptions()
-            reader.existing_camera_id = number
-
-            def extract(token: Any, names: list[str] = names, reader: Any = reader) -> None:
-                library.extract_features(
-                    self.database,
-                    self.folder,
-                    image_names=names,
-                    reader_options=reader,
-                    extraction_options=options,
-                    device=library.Device.cpu,
-                    cancellation_token=token,
-                )
-
-            run_cancellable(extract, self._watch("keypoints", len(self.names), "finding features"))
+            for start in range(0, len(names), PHOTOGRAPHS_AT_ONCE):
+                self.report(done, len(self.names), "finding features")
+                chunk = names[start : start + PHOTOGRAPHS_AT_ONCE]
+                store_features(self.database, self.folder, chunk, self.settings, number)
+                done += len(chunk)
 
     def match(self) -> None:
         """Match each photograph with those near it that look about the same way."""
-        pairs = sorted(_pairs(self.cameras))
-        listed = self.folder / "pairs.txt"
-        listed.write_text("".join(f"{self.names[a]} {self.names[b]}\n" for a, b in pairs), encoding="utf-8")
-        options = self.library.FeatureMatchingOptions()
-        options.num_threads, options.use_gpu = self.settings.threads, False
-        pairing = self.library.ImportedPairingOptions()
-        pairing.match_list_path = listed
-
-        def match(token: Any) -> None:
-            self.library.match_image_pairs(
-                self.database,
-                matching_options=options,
-                pairing_options=pairing,
-                device=self.library.Device.cpu,
-                cancellation_token=token,
-            )
-
-        run_cancellable(match, self._watch("two_view_geometries", len(pairs), "matching photographs"))
+        pairs = [(self.names[a], self.names[b]) for a, b in sorted(_pairs(self.cameras))]
+        match_features(self.database, pairs, self.settings, self.report)
 
     def triangulate(self) -> Any:
         """The reconstruction with the given poses and all points."""
@@ -163,9 +157,6 @@ class _Model:
             )
 
         return run_cancellable(run, lambda: self.report(0, 1, "triangulating"))
-
-    def _watch(self, table: str, total: int, text: str) -> Any:
-        return lambda: self.report(min(count_rows(self.database, table), total), total, text)
 
 
 def _pairs(cameras: Sequence[Camera]) -> set[tuple[int, int]]:

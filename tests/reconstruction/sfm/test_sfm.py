@@ -27,7 +27,7 @@ def found(corner, tmp_path_factory):
     """What structure from motion makes of the corner and one photograph that shows nothing."""
     folder = tmp_path_factory.mktemp("photos")
     for path in corner[0].glob("*.png"):
-        shutil.copy(path, folder)
+        shutil.copy(path, folder / f"photo {path.name}")  # with a space, as cameras and people write them
     write_rgb(folder / "blank.png", np.full((192, 256, 3), 0.5))
     out = tmp_path_factory.mktemp("sfm")
     return folder, out, estimate_poses(folder, out)
@@ -38,7 +38,7 @@ def test_poses_are_those_of_the_cameras_up_to_a_similarity(corner, found):
     assert len(registration.registered) == 8
     assert registration.error < 1
     views = load_views(out)
-    assert [view.stem for view in views] == [view.stem for view in corner[1]]
+    assert [view.stem for view in views] == [f"photo {view.stem}" for view in corner[1]]
     ours, truth = (np.stack([v.camera.position.numpy() for v in group]) for group in (views, corner[1]))
     matrix = similarity_between(ours, truth)
     assert np.linalg.norm(ours @ matrix[:3, :3].T + matrix[:3, 3] - truth, axis=1).max() < 0.05
@@ -89,10 +89,11 @@ def test_points_are_triangulated_with_the_given_poses_far_from_the_origin(corner
     assert colors.std() > 0.05
 
 
-def test_wrong_poses_leave_hardly_any_points(corner):
+def test_wrong_poses_leave_no_points_and_are_named(corner, caplog):
     order = (3, 0, 6, 1, 7, 4, 2, 5)
     wrong = [replace(view, camera=corner[1][other].camera) for view, other in zip(corner[1], order, strict=True)]
-    assert len(triangulate(wrong)[0]) < 50
+    assert len(triangulate(wrong)[0]) == 0
+    assert "the poses contradict the photographs" in caplog.text
 
 
 def test_the_sharpest_of_every_few_frames_is_kept(corner, tmp_path):
@@ -107,7 +108,9 @@ def test_the_sharpest_of_every_few_frames_is_kept(corner, tmp_path):
     assert extract_frames(video, tmp_path / "frames", every=3) == 8
     for view in corner[1]:
         kept = cv2.imread(str(tmp_path / "frames" / f"{int(view.stem):05d}.jpg")).astype(float)
-        assert np.abs(kept - cv2.imread(str(view.image_path))).mean() < 8
+        sharp = cv2.imread(str(view.image_path))
+        blurred = cv2.GaussianBlur(sharp, (15, 15), 5)
+        assert np.abs(kept - sharp).mean() < 0.7 * np.abs(kept - blurred).mean()
     (tmp_path / "no.mp4").write_bytes(b"no video")
     with pytest.raises(InputError, match=r"no\.mp4: 0 frames can be read"):
         extract_frames(tmp_path / "no.mp4", tmp_path / "none")

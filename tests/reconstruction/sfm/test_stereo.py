@@ -3,13 +3,12 @@
 from dataclasses import replace
 
 import numpy as np
-import pytest
 
 from sgwarp.reconstruction.stereo import estimate_depth
 
 
-@pytest.mark.parametrize("unit", [1.0, 1e-3])
-def test_depth_is_that_of_the_surface_in_any_unit(shots, unit):
+def test_depth_is_that_of_the_surface_in_any_unit(shots):
+    shots, unit = shots[:5], 1e-3
     cameras = []
     for camera, _, _ in shots:
         pose = camera.world_to_camera.clone()
@@ -25,7 +24,7 @@ def test_depth_is_that_of_the_surface_in_any_unit(shots, unit):
 
 
 def test_nothing_is_known_where_photographs_do_not_agree(shots):
-    random = np.random.default_rng(0)
+    random, shots = np.random.default_rng(0), shots[:4]
     noise = [random.random(image.shape).astype(np.float32) for _, image, _ in shots]
     maps = estimate_depth(noise, [camera for camera, _, _ in shots], 1.4)
     assert np.mean([found.known.mean() for found in maps]) < 0.2
