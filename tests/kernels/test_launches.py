@@ -14,6 +14,7 @@ from sgwarp.network.inputs import voxelize
 from sgwarp.network.layers.mink_unet import ARCHITECTURES, Architecture, MinkUNet
 from sgwarp.ops.deformation import deformed
 from sgwarp.ops.photometric import photometric_loss
+from sgwarp.ops.splatting.id_weights import weigh_pairs
 from sgwarp.ops.splatting.incremental import IncrementalLift
 from sgwarp.reconstruction.fitting.densify import Densify
 from sgwarp.reconstruction.fitting.initial import gaussians_from_points
@@ -69,6 +70,7 @@ def everything_that_has_kernels(monkeypatch) -> None:
     by_id = sg.FeatureMap("toy", ids=ids, vectors=torch.rand(5, CHANNELS, generator=g))
     for feature_map, mode in ((dense, "weighted"), (by_id, "weighted"), (dense, "center")):
         sg.lift(scene, views, dict.fromkeys("ab", feature_map), mode)
+    weigh_pairs(scene, camera, ids)
     sg.top_contributors(scene, camera, k=8)
     frames = IncrementalLift()
     for shift in (0.0, 0.05):  # a few Gaussians move from one frame to the next
