@@ -145,7 +145,9 @@ def _places_in_transforms(meta: Mapping[str, Any]) -> dict[str, Array]:
 
 
 def _places_in_model(model: Path) -> dict[str, Array]:
-    places = {}
+    places: dict[str, Array] = {}
+    if not any((model / f"images{suffix}").is_file() for suffix in (".bin", ".txt")):
+        return places  # points may come alone
     for record in read_images(model):
         norm = float(np.linalg.norm(record.quat))
         if norm > 0 and np.isfinite(norm) and np.isfinite(record.translation).all():

@@ -54,23 +54,9 @@ def gaussians_from_points(
     Raises:
         InputError: Fewer than 4 points or a cap below, one that is not finite, or colours that are not in [0, 1].
     """
-    positions, colours = (t.detach().cpu() if isinstance(t, Tensor) else np.asarray(t) for t in (positions, colours))
-    positions = torch.as_tensor(positions, dtype=torch.float64)
-    colours = torch.as_tensor(colours, dtype=torch.float32)
-    if positions.ndim != 2 or positions.shape[1] != 3 or colours.shape != positions.shape:
-        raise InputError(f"points: expected [N, 3] twice, got {list(positions.shape)} and {list(colours.shape)}")
-    if len(positions) < LEAST_POINTS:
-        raise InputError(f"points: a scene starts from at least {LEAST_POINTS}, got {len(positions)}; or from none")
+    positions, colours = checked_points(positions, colours)
     if settings.cap < LEAST_POINTS:
         raise InputError(f"cap: a scene starts from at least {LEAST_POINTS} points, got {settings.cap}")
-    for name, values in (("positions", positions), ("colours", colours)):
-        if not bool(torch.isfinite(values).all()):
-            row = int((~torch.isfinite(values)).any(dim=1).nonzero()[0])
-            raise InputError(f"points: {name} of point {row} are not finite; leave it out")
-    if not bool(((colours >= 0) & (colours <= 1)).all()):
-        raise InputError(
-            f"points: colours lie in {float(colours.min()):g} to {float(colours.max()):g}, not in [0, 1]; divide by 255"
-        )
     if len(positions) > settings.cap:
         drawn = torch.randperm(len(positions), generator=generator(settings.seed, 0, "points"))[: settings.cap]
         kept = drawn.sort().values
@@ -85,6 +71,30 @@ def gaussians_from_points(
         sh=((colours - 0.5) / SH_C0)[:, None, :],
     )
     return gaussians.to(device)
+
+
+def checked_points(positions: Any, colours: Any) -> tuple[Tensor, Tensor]:
+    """Points to start from, float64 [N, 3] and float32 [N, 3], both on the CPU.
+
+    Raises:
+        InputError: Fewer than 4, one that is not finite, or colors that are not in [0, 1].
+    """
+    positions, colours = (t.detach().cpu() if isinstance(t, Tensor) else np.asarray(t) for t in (positions, colours))
+    positions = torch.as_tensor(positions, dtype=torch.float64)
+    colours = torch.as_tensor(colours, dtype=torch.float32)
+    if positions.ndim != 2 or positions.shape[1] != 3 or colours.shape != positions.shape:
+        raise InputError(f"points: expected [N, 3] twice, got {list(positions.shape)} and {list(colours.shape)}")
+    if len(positions) < LEAST_POINTS:
+        raise InputError(f"points: a scene starts from at least {LEAST_POINTS}, got {len(positions)}; or from none")
+    for name, values in (("positions", positions), ("colours", colours)):
+        if not bool(torch.isfinite(values).all()):
+            row = int((~torch.isfinite(values)).any(dim=1).nonzero()[0])
+            raise InputError(f"points: {name} of point {row} are not finite; leave it out")
+    if not bool(((colours >= 0) & (colours <= 1)).all()):
+        raise InputError(
+            f"points: colours lie in {float(colours.min()):g} to {float(colours.max()):g}, not in [0, 1]; divide by 255"
+        )
+    return positions, colours
 
 
 def random_points(

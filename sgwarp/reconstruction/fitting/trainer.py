@@ -27,7 +27,13 @@ from sgwarp.reconstruction.fitting.coverage import report_start, seen_by_any
 from sgwarp.reconstruction.fitting.densify import Densify
 from sgwarp.reconstruction.fitting.exposure import Exposure
 from sgwarp.reconstruction.fitting.frame import Frame
-from sgwarp.reconstruction.fitting.initial import adapted, completed, gaussians_from_points, random_points
+from sgwarp.reconstruction.fitting.initial import (
+    adapted,
+    checked_points,
+    completed,
+    gaussians_from_points,
+    random_points,
+)
 from sgwarp.reconstruction.fitting.mcmc import MarkovChain
 from sgwarp.reconstruction.fitting.measurement import Measurement as Measurement
 from sgwarp.reconstruction.fitting.model import Gradients, Model
@@ -181,7 +187,8 @@ def _starting(
     if start is None:
         positions, colours, size = random_points(photographs, settings, report)
         return gaussians_from_points(positions, colours, settings, EXTENT, device, size)
-    positions, colours = frame.points(start[0]), start[1]
+    positions, colours = checked_points(*start)
+    positions = frame.points(positions)
     require_overlap(photographs, positions.to(torch.float32), held_out)  # before the cap thins them
     if len(positions) < min(FEW_POINTS, settings.cap // 2):
         positions, colours = completed(positions, colours, photographs, settings, report)
