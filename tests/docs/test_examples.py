@@ -4,6 +4,7 @@ A block that cannot run here is preceded by `<!-- not run: reason -->`. Only opt
 changed (SHORTER).
 """
 
+import hashlib
 import json
 import re
 import shlex
@@ -137,3 +138,11 @@ def test_links_lead_somewhere(page):
 
 def test_the_readme_is_short():
     assert len((ROOT / "README.md").read_text(encoding="utf-8").splitlines()) <= 120
+
+
+def test_rendered_notebooks_are_those_of_the_folder():
+    """Pages of notebooks carry a hash of their source; `python -m tools.render_notebooks` makes them again."""
+    for source in sorted((ROOT / "notebooks").glob("*.py")):
+        page = ROOT / "docs" / "notebooks" / f"{source.stem}.md"
+        digest = hashlib.sha256(source.read_bytes()).hexdigest()[:16]
+        assert page.read_text(encoding="utf-8").startswith(f"<!-- notebooks/{source.name} {digest} -->"), source.name
