@@ -43,6 +43,7 @@ def list_scenes(source: str) -> list[Scene]:
         InputError: There is no list, no scene in it, or two scenes have one name.
     """
     path = Path(source)
+    found: list[tuple[str, Path, dict[str, str]]]
     if path.is_dir():
         entries = sorted(p for p in path.iterdir() if p.name[0] != "." and (p.is_dir() or p.suffix == ".ply"))
         found = [(_name(p), p, {}) for p in entries]

@@ -50,6 +50,7 @@ class Task:
         runner: "module:function" that does a stage: `run(stage, arguments) -> None`, with `OUT` replaced.
         run: Of the driver's start; what failed in it is not tried again in it.
         limits: What the scene may take.
+        common: Arguments of every stage that do not change the results, such as the number of threads.
         retry: Try again what failed in an earlier run.
     """
 
@@ -60,6 +61,7 @@ class Task:
     runner: str
     run: str
     limits: Limits = Limits()
+    common: tuple[str, ...] = ()
     retry: bool = False
 
     @property
@@ -73,8 +75,8 @@ class Task:
     @classmethod
     def from_json(cls, values: dict[str, Any]) -> Task:
         stages = tuple(Stage(stage["name"], tuple(stage["arguments"])) for stage in values["stages"])
-        fixed = {"stages": stages, "inputs": tuple(values["inputs"]), "limits": Limits(**values["limits"])}
-        return cls(**{**values, **fixed})
+        tuples = {name: tuple(values[name]) for name in ("inputs", "common")}
+        return cls(**{**values, **tuples, "stages": stages, "limits": Limits(**values["limits"])})
 
 
 @dataclass(frozen=True)

@@ -20,7 +20,7 @@ OVER = 75  # exit code of a process that ended itself after it had recorded why
 
 
 @contextmanager
-def watched(limits: Limits, record: Callable[[str], None]) -> Iterator[None]:
+def watched(limits: Limits, record: Callable[[str], object]) -> Iterator[None]:
     """In the block, what goes beyond a limit is recorded and ends the process.
 
     Native code can be stuck without giving the interpreter back: then SIGALRM ends the process, without a record.

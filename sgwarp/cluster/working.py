@@ -32,8 +32,8 @@ def settled(task: Task) -> Outcome | None:
     if failed and not task.retry and _same(failed, task):
         return Outcome(task.name, "failed", str(failed.get("error")))
     if done and _same(done, task):
-        known = {name: done.get(name) for name in ("seconds", "peak_memory", "figures") if done.get(name)}
-        return Outcome(task.name, "skipped", **known)
+        known = done.get("seconds", {}), done.get("peak_memory", 0), done.get("figures", {})
+        return Outcome(task.name, "skipped", "", *known)
     return None
 
 
@@ -97,7 +97,7 @@ def give_up(task: Task, line: str) -> Outcome:
 def _do(task: Task, place: Place, name: str, arguments: tuple[str, ...]) -> dict[str, Any]:
     """Run a stage in the folder at work; returns its record."""
     start = time.perf_counter()
-    named_function(task.runner)(name, [word.replace(OUT, str(place.partial)) for word in arguments])
+    named_function(task.runner)(name, [word.replace(OUT, str(place.partial)) for word in (*arguments, *task.common)])
     seconds = time.perf_counter() - start
     log = place.partial / "run.json"
     run = read_json(log)

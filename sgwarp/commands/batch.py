@@ -8,7 +8,7 @@ from collections.abc import Iterable
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Literal
+from typing import TYPE_CHECKING, Any, Literal
 
 import tyro
 
@@ -133,15 +133,14 @@ class Batch:
         if wrong := [f"{key}{sign}{value}" for key, sign, value in pairs if not (key and sign)]:
             raise InputError(f"--options: expected option=value, got {wrong[0]!r}")
         options = {key: value for key, _, value in pairs}
-        plan = Plan(tuple(filter(None, self.do.split(","))), options, self.device, self._threads())
+        plan = Plan(tuple(filter(None, self.do.split(","))), options, self.device)
         limits = Limits(self.time_limit, None if self.memory_limit is None else int(self.memory_limit * 1e9))
-        fixed = {"folder": str(self.out.absolute()), "runner": "sgwarp.commands.scene_stages:run_stage"}
-        run, tasks = secrets.token_hex(8), []
+        fixed: dict[str, Any] = {"folder": str(self.out.absolute()), "runner": "sgwarp.commands.scene_stages:run_stage"}
+        fixed |= {"run": secrets.token_hex(8), "limits": limits, "retry": self.retry_failed}
+        common, tasks = ("--threads", str(self._threads())), []
         for scene in scenes:
             stages, inputs = stages_of(scene, plan)
-            tasks.append(
-                Task(scene.name, **fixed, stages=stages, inputs=inputs, run=run, limits=limits, retry=self.retry_failed)
-            )
+            tasks.append(Task(name=scene.name, stages=stages, inputs=inputs, common=common, **fixed))
         if tasks:
             for stage in tasks[0].stages:
                 parse(stage.name, [word.replace(OUT, "out") for word in stage.arguments])

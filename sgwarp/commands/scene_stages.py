@@ -43,13 +43,11 @@ class Plan:
         stages: Names, in order.
         options: "stage.option" or "option": value; those of a scene go before these.
         device: Where each command computes.
-        threads: Host threads of each.
     """
 
     stages: tuple[str, ...]
     options: Mapping[str, str]
     device: str
-    threads: int
 
     def __post_init__(self) -> None:
         if not self.stages:
@@ -82,11 +80,9 @@ def stages_of(scene: Scene, plan: Plan) -> tuple[tuple[Stage, ...], tuple[str, .
             words += ["--views", str(views)]
         if name == "segment":
             words += ["--semantics", LIFTED]
-        if name == "predict" and "lift" in plan.stages and "projection" not in given:
-            words += ["--projection", LIFTED]
-        if name == "segment" and "predict" in plan.stages and "predicted" not in given:
+        if name == "segment" and "predict" in plan.stages and "predicted" not in [option.name for option in given]:
             words += ["--predicted", PREDICTED]
-        words += ["--out", OUTPUTS[name], "--device", plan.device, "--threads", str(plan.threads)]
+        words += ["--out", OUTPUTS[name], "--device", plan.device]
         for option, value in given.items():
             value = _absolute(value.replace("{scene}", scene.name).replace("{path}", str(scene.path)))
             if option.name not in NO_INPUT:
