@@ -46,7 +46,7 @@ class RayEngine:
         Raises:
             InputError: Ray is not installed, or its cluster is not to be reached.
         """
-        ray = _import_ray()
+        ray = _import_ray(alone=self.address is None)
         self._connect(ray)
         try:
             yield from self._run(ray, iter(tasks))
@@ -57,7 +57,11 @@ class RayEngine:
         import sys
 
         variables = {**self.environment, "PYTHONPATH": os.pathsep.join(os.path.abspath(path) for path in sys.path)}
-        settings: dict[str, Any] = {"log_to_driver": False, "runtime_env": {"env_vars": variables}}
+        settings: dict[str, Any] = {
+            "log_to_driver": False,
+            "logging_level": "ERROR",
+            "runtime_env": {"env_vars": variables},
+        }
         if self.address is None:
             settings |= {"num_cpus": self.workers * self.cores, "include_dashboard": False}
             settings |= {"object_store_memory": STORE, "_node_ip_address": "127.0.0.1"}
@@ -91,13 +95,20 @@ def _outcome(ray: Any, reference: Any, task: Task) -> Outcome:
         return give_up(task, f"{TRIES} processes ended at it, or Ray lost them ({type(error).__name__}: {line})")
 
 
-def _import_ray() -> Any:
-    os.environ.setdefault("RAY_USAGE_STATS_ENABLED", "0")
-    os.environ.setdefault("RAY_ACCEL_ENV_VAR_OVERRIDE_ON_ZERO", "0")
+def _import_ray(alone: bool) -> Any:
+    """Ray, which reads these variables when it is imported."""
+    os.environ["RAY_USAGE_STATS_ENABLED"] = "0"
+    os.environ.setdefault("RAY_ACCEL_ENV_VAR_OVERRIDE_ON_ZERO", "0")  # a worker without GPUs sees them, as locally
+    if alone:  # on every system as on macOS: servers listen on 127.0.0.1, not on all addresses
+        os.environ["RAY_ENABLE_WINDOWS_OR_OSX_CLUSTER"] = "0"
     try:
         import ray
     except ImportError:
         raise InputError("--engine ray: needs Ray; run: pip install 'sgwarp[cluster]'") from None
+    from ray._private.ray_constants import ENABLE_RAY_CLUSTER
+
+    if alone and ENABLE_RAY_CLUSTER:
+        raise InputError("--engine ray: Ray was imported before, and would listen on all addresses; give an --address")
     return ray
 
 

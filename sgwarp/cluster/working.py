@@ -99,9 +99,11 @@ def _do(task: Task, place: Place, name: str, arguments: tuple[str, ...]) -> dict
     start = time.perf_counter()
     named_function(task.runner)(name, [word.replace(OUT, str(place.partial)) for word in (*arguments, *task.common)])
     seconds = time.perf_counter() - start
-    log = place.partial / "run.json"
-    run = read_json(log)
-    if run:  # the next command would write over it
+    # The command's log lies beside its output or in it; there the next command would write over it.
+    logs = [place.partial / "run.json", *place.partial.glob("*/run.json")]
+    log = max(filter(Path.is_file, logs), key=lambda path: path.stat().st_mtime_ns, default=None)
+    run = read_json(log) if log else {}
+    if log:
         text = log.read_text(encoding="utf-8").replace(str(place.partial), str(place.final))
         (place.partial / f"{name}.run.json").write_text(text, encoding="utf-8")
         log.unlink()
