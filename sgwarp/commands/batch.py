@@ -31,15 +31,17 @@ WARM = "sgwarp.commands.scene_stages:warm"
 class Batch:
     """Run commands on many scenes: what is done is skipped, what changed is done again, what fails stops nothing.
 
-    Results of a scene lie in OUT/SCENE: scene.ply, scene.safetensors (lifted), predicted.safetensors, labels, renders,
-    and done.json. A table of all scenes is summary.csv. The exit code is 1 if a scene failed.
+    Results of a scene lie in OUT/SCENE: scene.ply, scene.safetensors (lifted), predicted.safetensors, labels,
+    instances.safetensors, renders, and done.json. A table of all scenes is summary.csv. The exit code is 1 if a scene
+    failed.
     """
 
     scenes: tyro.conf.Positional[str]
     """A folder of scenes, a pattern in quotes, a .txt file of paths, or a .csv file with a column `path`."""
 
     do: str
-    """What to do with each, separated by commas: fit, lift, predict, segment, render."""
+    """What to do with each, separated by commas: fit, lift, predict, segment, instances,
+    render."""
 
     out: Path
     """Folder of the results, one folder per scene."""

@@ -14,6 +14,7 @@ from typing import Any
 from sgwarp.cluster.listing import Scene
 from sgwarp.cluster.tasks import OUT, Stage
 from sgwarp.commands.fit import Fit
+from sgwarp.commands.instances import Instances
 from sgwarp.commands.lift import Lift
 from sgwarp.commands.options import Options
 from sgwarp.commands.predict import Predict
@@ -26,10 +27,18 @@ COMMANDS: dict[str, type[Options]] = {
     "lift": Lift,
     "predict": Predict,
     "segment": Segment,
+    "instances": Instances,
     "render": Render,
 }
 SCENE, LIFTED, PREDICTED = f"{OUT}/scene.ply", f"{OUT}/scene.safetensors", f"{OUT}/predicted.safetensors"
-OUTPUTS = {"fit": SCENE, "lift": LIFTED, "predict": PREDICTED, "segment": f"{OUT}/labels", "render": f"{OUT}/renders"}
+OUTPUTS = {
+    "fit": SCENE,
+    "lift": LIFTED,
+    "predict": PREDICTED,
+    "segment": f"{OUT}/labels",
+    "instances": f"{OUT}/instances.safetensors",
+    "render": f"{OUT}/renders",
+}
 COMMON = ("views", "scene")  # options of a scene that name its files
 FIXED = ("out", "device", "threads", "command_line", "resume", *COMMON)  # not options of a stage
 NO_INPUT = ("cache",)  # what lies there does not change the results
@@ -76,7 +85,7 @@ def stages_of(scene: Scene, plan: Plan) -> tuple[tuple[Stage, ...], tuple[str, .
     for name in plan.stages:
         given = _given(COMMANDS[name], name, own)
         words = [str(views)] if name == "fit" else [str(gaussians)]
-        if name in ("lift", "segment", "render"):
+        if name in ("lift", "segment", "instances", "render"):
             words += ["--views", str(views)]
         if name == "segment":
             words += ["--semantics", LIFTED]
