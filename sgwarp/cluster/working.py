@@ -65,7 +65,7 @@ def _work(task: Task, place: Place) -> Outcome:
         with watched(task.limits, fail):
             known["inputs"] = fingerprint(task.inputs, contents=True)
             stages = _resumed(task, place, known["inputs"])
-            with _written_to(place.partial / LOG):
+            with written_to(place.partial / LOG):
                 for stage in task.stages:
                     if stage.name not in stages:
                         stages[stage.name] = _do(task, place, stage.name, stage.arguments)
@@ -170,7 +170,7 @@ def _contents(inputs: Any) -> dict[str, str]:
 
 
 @contextmanager
-def _written_to(path: Path) -> Iterator[None]:
+def written_to(path: Path) -> Iterator[None]:
     """In the block, what goes to stdout and stderr goes to a file, native libraries' lines included."""
     sys.stdout.flush()
     sys.stderr.flush()

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import io
 import logging
+import os
 import shlex
 from collections.abc import Mapping, Sequence
 from contextlib import redirect_stderr, redirect_stdout, suppress
@@ -148,6 +149,7 @@ def warm(stages: Sequence[str], encoder: str | None, device: str) -> None:
     """
     import tempfile
 
+    from sgwarp.cluster.working import written_to
     from sgwarp.demo.data import ROOM
 
     views, scene = str(ROOM), str(ROOM / "room.compressed.ply")
@@ -162,7 +164,7 @@ def warm(stages: Sequence[str], encoder: str | None, device: str) -> None:
             "render": [scene, "--views", views, "--view", "0002", "--out", f"{out}/renders"],
         }
         for name in stages:
-            with suppress(Exception):
+            with suppress(Exception), written_to(Path(os.devnull)):
                 if name in arguments:
                     run_stage(name, [*arguments[name], "--device", device])
 
