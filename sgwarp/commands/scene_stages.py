@@ -189,10 +189,11 @@ def _sources(scene: Scene, own: Mapping[str, str], fitted: bool) -> tuple[Path, 
 
 
 def _check_options(own: Mapping[str, str], stages: Sequence[str], scene: str) -> None:
-    known = {name: {option.name for option in fields(COMMANDS[name])} - set(FIXED) for name in stages}
+    """Options of stages that are not asked for may stand in a list, which serves several runs."""
+    known = {name: {option.name for option in fields(COMMANDS[name])} - set(FIXED) for name in COMMANDS}
     for key in own:
         stage, dot, option = key.replace("-", "_").rpartition(".")
-        fits = option in known.get(stage, ()) if dot else option in COMMON or any(option in k for k in known.values())
+        fits = option in known.get(stage, ()) if dot else option in COMMON or any(option in known[k] for k in stages)
         if not fits:
             raise InputError(
                 f"scene {scene}: no stage of --do has the option '{key}'; write stage.option, see `sgwarp STAGE --help`"

@@ -68,6 +68,7 @@ def test_commands_run_on_scenes(scans, tmp_path, capsys, stage_files):
         (("--do", "segment,lift"), "in the order"),
         (("--do", ""), "name what to do"),
         (("--do", "lift", "--options", "lift.color=7"), "lift.color"),
+        (("--do", "lift", "--options", "steps=7"), "steps"),
         (("--do", "lift", "--options", "lift.tau"), "option=value"),
         (("--do", "lift", "--options", "lift.tau=much"), "tau"),
         (("--do", "lift", "--options", "lift.deterministic=maybe"), "true or false"),
@@ -86,7 +87,9 @@ def test_bad_options_are_refused_before_anything_is_done(scans, tmp_path, capsys
 
 
 def test_a_scene_goes_from_stage_to_stage(scans):
-    scene = Scene("one", scans / "one", {"fit.steps": "30", "steps": "50", "segment.classes": "a,b"})
+    scene = Scene(
+        "one", scans / "one", {"fit.steps": "30", "steps": "50", "segment.classes": "a,b", "render.size": "7 5"}
+    )
     stages, inputs = stages_of(scene, Plan(("fit", "lift", "predict", "segment"), {"predict.net": "net.x"}, "cpu"))
     fit, lift, predict, segment = (parse(stage.name, stage.arguments) for stage in stages)
     assert (fit.views, fit.steps, str(fit.out)) == (scans / "one", 30, "{out}/scene.ply")
