@@ -1,6 +1,7 @@
 """The command line: `sgwarp COMMAND ...`.
 
-Exit codes: 0 done, 2 bad input or usage (one line on stderr says what), 130 interrupted; outputs are whole or absent.
+Exit codes: 0 done, 1 some of many scenes failed, 2 bad input or usage (one line on stderr says what), 130 interrupted;
+outputs are whole or absent.
 """
 
 from __future__ import annotations
@@ -69,8 +70,8 @@ def _run(argv: list[str]) -> int:
     command = tyro.extras.subcommand_cli_from_dict(dict(COMMANDS), prog="sgwarp", description=description, args=argv)
     command.command_line = shlex.join(["sgwarp", *argv])
     with _notices():
-        command.run()
-    return 0
+        code = command.run()
+    return code or 0
 
 
 def _fail(message: str, code: int) -> int:

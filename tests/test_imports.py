@@ -26,6 +26,7 @@ COMMANDS = (
     "report",
     "instances",
     "edit",
+    "batch",
 )
 
 

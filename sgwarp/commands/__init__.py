@@ -3,6 +3,7 @@
 Only `sgwarp.cli` imports this package, once tyro is known to be there; torch and warp come with `run`.
 """
 
+from sgwarp.commands.batch import Batch
 from sgwarp.commands.convert import Convert
 from sgwarp.commands.demo import Demo
 from sgwarp.commands.distill import Distill
@@ -32,6 +33,7 @@ COMMANDS = {
     "instances": Instances,
     "edit": Edit,
     "render": Render,
+    "batch": Batch,
     "info": Info,
     "convert": Convert,
     "encoders": Encoders,

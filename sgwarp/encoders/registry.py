@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
+from functools import partial
+from typing import Any
 
 import torch
 
@@ -20,6 +22,7 @@ from sgwarp.errors import InputError
 from sgwarp.scene import View
 
 Device = str | torch.device
+_kept: dict[str, Any] | None = None  # sources and text sides, once `keep_encoders` was called
 
 
 def make_encoder(
@@ -54,8 +57,29 @@ def make_encoder(
     return CachedMaps(source, cache, DEFAULT_LIMIT if cache_limit is None else cache_limit)
 
 
+def keep_encoders() -> None:
+    """From now on, what a name and a device make is kept for the next time: for a process that does many scenes.
+
+    What is complete by itself, such as files, depends on the views and is made anew each time.
+    """
+    global _kept
+    _kept = {} if _kept is None else _kept
+
+
 def _make_member(member: Member, request: Request) -> MapSource:
-    return builder(member.source.kind.make)(member, request)
+    make = builder(member.source.kind.make)
+    if member.source.kind.role == "maps":
+        return make(member, request)
+    return _keep(repr((member, str(request.device))), lambda: make(member, request))
+
+
+def _keep(key: str, make: Callable[[], Any]) -> Any:
+    """What is kept under a key, or what `make` makes."""
+    if _kept is None:
+        return make()
+    if key not in _kept:
+        _kept[key] = make()
+    return _kept[key]
 
 
 def text_encoder_for(
@@ -79,7 +103,8 @@ def text_encoder_for(
         name = "conse"
     if name is None:
         raise InputError(f"no text encoder for space '{space}' is known; name the encoder it was lifted with")
-    encoder = make_text_encoder(name, device, templates)
+    key = repr(("text", name, str(device), templates))
+    encoder = _keep(key, partial(make_text_encoder, name, device, templates))
     require_same_space(space, encoder.space, f"encoder {name}")
     return encoder
 

@@ -1,0 +1,167 @@
+"""The list of scenes: a folder, a pattern, a text file or a CSV file."""
+
+from __future__ import annotations
+
+import csv
+import glob
+import shlex
+from collections.abc import Iterable, Iterator, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+
+from sgwarp.errors import InputError
+
+RESERVED = ("shards",)  # folders of the output that are no scenes
+POINTS = ("points3D.ply", "sparse_pc.ply", "point_cloud.ply")  # of data sets, to start a fit from
+MAGIC = ("*", "?", "[")
+
+
+@dataclass(frozen=True)
+class Scene:
+    """One line of the list.
+
+    Attributes:
+        name: Of its folder in the output.
+        path: A data set, a folder of photographs or a .ply file; absolute.
+        options: "stage.option" or "option": value, of this scene alone.
+    """
+
+    name: str
+    path: Path
+    options: dict[str, str] = field(default_factory=dict)
+
+
+def list_scenes(source: str) -> list[Scene]:
+    """The scenes that a list names.
+
+    Args:
+        source: A folder, each of whose folders and .ply files is a scene; a pattern such as "scans/*/dslr"; a .txt file
+            with a path in each line, followed by option=value if needed; or a .csv file with a column `path`, perhaps
+            `name`, and one for each option. Paths in a file are relative to it.
+
+    Raises:
+        InputError: There is no list, no scene in it, or two scenes have one name.
+    """
+    path = Path(source)
+    found: list[tuple[str, Path, dict[str, str]]]
+    if path.is_dir():
+        entries = sorted(p for p in path.iterdir() if p.name[0] != "." and (p.is_dir() or p.suffix == ".ply"))
+        found = [(_name(p), p, {}) for p in entries]
+    elif path.suffix == ".csv" and path.is_file():
+        found = list(_csv_rows(path))
+    elif path.is_file():
+        found = list(_text_lines(path))
+    elif any(mark in source for mark in MAGIC):
+        matches = sorted(map(Path, glob.glob(source, recursive=True)))
+        found = list(zip(_names_apart(matches), matches, [{} for _ in matches], strict=True))
+    else:
+        raise InputError(f"{source}: no such folder, list or pattern; check the path")
+    scenes = [Scene(name, place.absolute(), options) for name, place, options in found]
+    if not scenes:
+        raise InputError(f"{source}: names no scene; a folder of scenes has a folder or a .ply file for each")
+    _check_names(scenes, source)
+    return scenes
+
+
+def shard_of(scenes: Sequence[Scene], shard: str) -> list[Scene]:
+    """The share "i/n" of a list: every n-th scene from the i-th on, counted from 0.
+
+    Raises:
+        InputError: It is not written so, or i is not below n.
+    """
+    index, count = parse_shard(shard)
+    return list(scenes[index::count])
+
+
+def parse_shard(shard: str) -> tuple[int, int]:
+    """i and n of "i/n".
+
+    Raises:
+        InputError: As `shard_of`.
+    """
+    first, slash, second = shard.partition("/")
+    if not (slash and first.isascii() and first.isdigit() and second.isascii() and second.isdigit()):
+        raise InputError(f"--shard {shard}: expected i/n, such as 0/4 for the first of four")
+    index, count = int(first), int(second)
+    if index >= count:
+        raise InputError(
+            f"--shard {shard}: shards are counted from 0; expected 0/{count} to {max(count - 1, 0)}/{count}"
+        )
+    return index, count
+
+
+def _csv_rows(path: Path) -> Iterator[tuple[str, Path, dict[str, str]]]:
+    rows = csv.DictReader(_read(path).splitlines())
+    if "path" not in (rows.fieldnames or ()):
+        raise InputError(f"{path}: has no column 'path'; its first line names the columns: path,name,fit.steps,...")
+    for row in rows:
+        if None in row:
+            raise InputError(f"{path}: line {rows.line_num} has more cells than there are columns; quote commas")
+        cells = {key.strip(): (value or "").strip() for key, value in row.items()}
+        if not cells["path"]:
+            raise InputError(f"{path}: line {rows.line_num} has no path")
+        place = path.parent / cells.pop("path")
+        yield cells.pop("name", "") or _name(place), place, {key: value for key, value in cells.items() if value}
+
+
+def _text_lines(path: Path) -> Iterator[tuple[str, Path, dict[str, str]]]:
+    for number, line in enumerate(_read(path).splitlines(), start=1):
+        try:
+            words = shlex.split(line, comments=True)
+        except ValueError as error:
+            raise InputError(f"{path}: line {number} cannot be read ({error}); quote spaces in pairs") from None
+        if not words:
+            continue
+        pairs = [word.partition("=") for word in words[1:]]
+        wrong = next((word for word, pair in zip(words[1:], pairs, strict=True) if not (pair[0] and pair[1])), None)
+        if wrong is not None:
+            raise InputError(f"{path}: line {number}: expected option=value after the path, got {wrong!r}")
+        options = {key: value for key, _, value in pairs}
+        place = path.parent / words[0]
+        yield options.pop("name", "") or _name(place), place, options
+
+
+def _read(path: Path) -> str:
+    try:
+        return path.read_text(encoding="utf-8-sig")
+    except (OSError, UnicodeDecodeError) as error:
+        raise InputError(f"{path}: cannot be read as text ({error}); a list is UTF-8 text") from None
+
+
+def _name(path: Path) -> str:
+    """Of a scene: its folder's or file's name, without the suffixes of a .ply."""
+    name = path.absolute().name
+    return name.removesuffix(".ply").removesuffix(".compressed") if path.suffix == ".ply" else name
+
+
+def _names_apart(paths: Sequence[Path]) -> list[str]:
+    """Names of the paths; if the last part is the same for all, as in scans/*/dslr, of the folder above."""
+    while len(paths) > 1 and len({p.name for p in paths}) == 1:
+        paths = [p.parent for p in paths]
+    return [_name(p) for p in paths]
+
+
+def _check_names(scenes: Iterable[Scene], source: str) -> None:
+    seen: dict[str, Scene] = {}
+    for scene in scenes:
+        name = scene.name
+        if not name or name[0] == "." or "/" in name or "\\" in name or not name.isprintable() or name in RESERVED:
+            raise InputError(f"{source}: {name!r} cannot be the name of a folder of results; give it another name")
+        if name in seen:
+            both = f"{seen[name].path} and {scene.path}"
+            raise InputError(f"{source}: two scenes are named {name}: {both}; give names in a .csv list")
+        seen[name] = scene
+
+
+def gaussians_in(folder: Path) -> Path:
+    """The trained scene in a folder: scene.ply, or the only .ply there that holds no points to start from.
+
+    Raises:
+        InputError: There is none, or more than one.
+    """
+    if (folder / "scene.ply").is_file():
+        return folder / "scene.ply"
+    found = sorted(p for p in folder.glob("*.ply") if p.name not in POINTS)
+    if len(found) != 1:
+        raise InputError(f"{folder}: holds {len(found)} scenes (.ply); name one with the option scene, or do fit first")
+    return found[0]

@@ -1,0 +1,177 @@
+"""`sgwarp batch`: other commands, on many scenes."""
+
+from __future__ import annotations
+
+import os
+import secrets
+from collections.abc import Iterable
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Literal
+
+import tyro
+
+from sgwarp.commands.options import check_folder
+from sgwarp.errors import InputError
+from sgwarp.runs.log import RunLog
+from sgwarp.runs.progress import show_progress
+
+if TYPE_CHECKING:
+    from sgwarp.cluster.listing import Scene
+    from sgwarp.cluster.summary import Tally
+    from sgwarp.cluster.tasks import Engine, Task
+
+LOOKS = 16  # threads that look at what is done: network file systems answer slowly
+PREPARE = "sgwarp.commands.scene_stages:prepare"
+WARM = "sgwarp.commands.scene_stages:warm"
+
+
+@dataclass(kw_only=True)
+class Batch:
+    """Run commands on many scenes: what is done is skipped, what changed is done again, what fails stops nothing.
+
+    Results of a scene lie in OUT/SCENE: scene.ply, scene.safetensors (lifted), predicted.safetensors, labels,
+    instances.safetensors, renders, and done.json. A table of all scenes is summary.csv. The exit code is 1 if a scene
+    failed.
+    """
+
+    scenes: tyro.conf.Positional[str]
+    """A folder of scenes, a pattern in quotes, a .txt file of paths, or a .csv file with a column `path`."""
+
+    do: str
+    """What to do with each, separated by commas: fit, lift, predict, segment, instances,
+    render."""
+
+    out: Path
+    """Folder of the results, one folder per scene."""
+
+    options: tuple[str, ...] = ()
+    """Options of the commands, such as fit.steps=7000 lift.encoder=files:{path}/labels; {path} is the scene's in the
+    list, {scene} its name. Columns of a .csv list named so hold for one scene."""
+
+    engine: Literal["local", "ray"] = "local"
+    """local: processes on this machine. ray: a Ray cluster, or Ray on this machine."""
+
+    address: str | None = None
+    """Of a Ray cluster; if not given, Ray is started on this machine and reachable from it alone."""
+
+    shard: str | None = None
+    """i/n: only every n-th scene from the i-th on, counted from 0; for array jobs."""
+
+    workers: int = 1
+    """Scenes at a time."""
+
+    threads: int | None = None
+    """Host threads of each worker; if not given, the cores of this machine divided by the workers."""
+
+    device: str = "cpu"
+    """Where to compute: cpu, cuda or cuda:N."""
+
+    gpus: float | None = None
+    """Of Ray: GPUs reserved for each worker, such as 0.5; 1 on cuda if not given."""
+
+    retry_failed: bool = False
+    """Try again what failed before; otherwise it is tried again once its inputs or options have changed."""
+
+    time_limit: float | None = None
+    """Of a scene [seconds]."""
+
+    memory_limit: float | None = None
+    """Of a scene, resident [gigabytes]."""
+
+    command_line: tyro.conf.Suppress[str] = ""
+
+    def run(self) -> int:
+        """Returns the exit code."""
+        from sgwarp.cluster.listing import list_scenes, shard_of
+        from sgwarp.cluster.summary import Tally, table, write_table
+
+        self._check()
+        scenes = list_scenes(self.scenes)
+        chosen = shard_of(scenes, self.shard) if self.shard is not None else scenes
+        tasks = self._tasks(chosen)
+        log = RunLog(command=self.command_line, device=self.device, threads=self._threads())
+        tally = Tally()
+        with log.stage("batch", wait=False):
+            self._do(tasks, tally)
+        folder = self.out / "shards" / self.shard.replace("/", "-of-") if self.shard is not None else self.out
+        folder.mkdir(parents=True, exist_ok=True)
+        write_table(tally.outcomes, folder / "summary.csv")
+        for outcome in tally.outcomes:
+            for stage, seconds in outcome.seconds.items() if outcome.status == "done" else ():
+                log.stages[stage] = log.stages.get(stage, 0.0) + seconds
+        log.leave_out("scenes_done_before", tally.count("skipped"))
+        log.error |= {"done": tally.count("done"), "failed": tally.count("failed")}
+        log.outputs += [str(self.out / outcome.name) for outcome in tally.outcomes if outcome.status != "failed"]
+        log.outputs.append(str(folder / "summary.csv"))
+        log.write(folder)
+        print(table(tally.outcomes))
+        return 1 if tally.count("failed") else 0
+
+    def _check(self) -> None:
+        check_folder("--out", self.out)
+        if self.workers < 1:
+            raise InputError(f"--workers: expected 1 or more, got {self.workers}")
+        if self.threads is not None and self.threads < 1:
+            raise InputError(f"--threads: expected 1 or more, got {self.threads}")
+        for name, value in (("time-limit", self.time_limit), ("memory-limit", self.memory_limit)):
+            if value is not None and not 0 < value < float("inf"):
+                raise InputError(f"--{name}: expected a positive number, got {value}")
+        if self.engine == "local" and (self.address is not None or self.gpus is not None):
+            raise InputError("--address and --gpus: are for --engine ray")
+
+    def _threads(self) -> int:
+        affinity = getattr(os, "sched_getaffinity", None)
+        cores = len(affinity(0)) if affinity else os.cpu_count() or 1
+        return self.threads or max(1, cores // self.workers)
+
+    def _tasks(self, scenes: Iterable[Scene]) -> list[Task]:
+        """Tasks of the scenes; bad options are found before anything is done."""
+        from sgwarp.cluster.tasks import OUT, Limits, Task
+        from sgwarp.commands.scene_stages import Plan, parse, stages_of
+
+        pairs = [pair.partition("=") for pair in self.options]
+        if wrong := [f"{key}{sign}{value}" for key, sign, value in pairs if not (key and sign)]:
+            raise InputError(f"--options: expected option=value, got {wrong[0]!r}")
+        options = {key: value for key, _, value in pairs}
+        plan = Plan(tuple(filter(None, self.do.split(","))), options, self.device)
+        limits = Limits(self.time_limit, None if self.memory_limit is None else int(self.memory_limit * 1e9))
+        fixed: dict[str, Any] = {"folder": str(self.out.absolute()), "runner": "sgwarp.commands.scene_stages:run_stage"}
+        fixed |= {"run": secrets.token_hex(8), "limits": limits, "retry": self.retry_failed}
+        common, tasks = ("--threads", str(self._threads())), []
+        for scene in scenes:
+            stages, inputs = stages_of(scene, plan)
+            tasks.append(Task(name=scene.name, stages=stages, inputs=inputs, common=common, **fixed))
+        if tasks:
+            for stage in tasks[0].stages:
+                parse(stage.name, [word.replace(OUT, "out") for word in stage.arguments])
+        return tasks
+
+    def _engine(self, tasks: list[Task]) -> Engine:
+        from sgwarp.cluster.local import Call, LocalEngine
+
+        environment = {"OMP_NUM_THREADS": str(self._threads()), "OMP_WAIT_POLICY": "passive"}
+        options = dict(pair.split("=", 1) for pair in self.options)
+        encoder = options.get("lift.encoder", options.get("encoder", "conse"))
+        warm = Call(WARM, (self.do.split(","), encoder, self.device)) if min(self.workers, len(tasks)) > 1 else None
+        if self.engine == "local":
+            return LocalEngine(self.workers, Call(PREPARE), warm, environment)
+        from sgwarp.cluster.ray_engine import RayEngine
+
+        gpus = self.gpus if self.gpus is not None else float(self.device.startswith("cuda"))
+        return RayEngine(self.workers, self._threads(), gpus, self.address, Call(PREPARE), warm, environment)
+
+    def _do(self, tasks: list[Task], tally: Tally) -> None:
+        """Fill the tally: with what is settled first, then with what the engine does."""
+        from sgwarp.cluster.working import settled
+
+        with show_progress("batch") as progress, ThreadPoolExecutor(LOOKS) as looks:
+            progress(0, len(tasks), "")
+            known = list(looks.map(settled, tasks))
+            tally.outcomes += [outcome for outcome in known if outcome is not None]
+            before = len(tally.outcomes)
+            waiting = [task for task, outcome in zip(tasks, known, strict=True) if outcome is None]
+            for outcome in self._engine(waiting)(waiting) if waiting else ():
+                tally.outcomes.append(outcome)
+                progress(len(tally.outcomes), len(tasks), tally.line(len(tasks), before))

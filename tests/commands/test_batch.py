@@ -1,0 +1,104 @@
+"""`sgwarp batch` with the real commands, in worker processes."""
+
+import json
+import shutil
+
+import pytest
+
+from sgwarp.cli import main
+from sgwarp.cluster.listing import Scene
+from sgwarp.commands.scene_stages import Plan, parse, stages_of
+from sgwarp.errors import InputError
+
+
+def run(*arguments) -> int:
+    return main(["batch", *map(str, arguments)])
+
+
+@pytest.fixture(scope="module")
+def scans(stage_files, tmp_path_factory):
+    """Two scenes, and one without its Gaussians."""
+    folder = tmp_path_factory.mktemp("batch") / "scans"
+    for name in ("one", "two", "bad"):
+        shutil.copytree(stage_files.views, folder / name)
+        shutil.copytree(stage_files.labels, folder / name / "labels")
+        (folder / name / "scene.ply").write_bytes(stage_files.scene.read_bytes() if name != "bad" else b"no ply")
+    return folder
+
+
+OPTIONS = ("--options", "lift.encoder=files:{path}/labels", "segment.view=0001")
+
+
+def test_commands_run_on_scenes(scans, tmp_path, capsys, stage_files):
+    out = tmp_path / "out"
+    arguments = (scans, "--do", "lift,segment", "--out", out, "--threads", 1, *OPTIONS)
+    assert run(*arguments) == 1
+    said = capsys.readouterr().out
+    assert "2 done, 0 skipped, 1 failed scenes" in said
+    assert "bad: " in said
+    done = json.loads((out / "one" / "done.json").read_text())
+    assert done["figures"]["lift"]["coverage"] > 0.5
+    assert set(done["seconds"]) == {"lift", "segment"}
+    assert (
+        str(out / "one" / "labels" / "0001.png")
+        in json.loads((out / "one" / "segment.run.json").read_text())["outputs"]
+    )
+    assert "scene.ply" in json.loads((out / "bad" / "failed.json").read_text())["error"]
+    log = json.loads((out / "run.json").read_text())
+    assert log["error"] == {"done": 2, "failed": 1}
+    assert (out / "summary.csv").read_text().splitlines()[1].startswith("bad,failed")
+
+    # The same as the commands by themselves.
+    alone = tmp_path / "alone"
+    views = scans / "two"
+    lift = ["lift", views / "scene.ply", "--views", views, "--encoder", f"files:{views / 'labels'}"]
+    assert main([*map(str, lift), "--out", str(alone / "scene.safetensors")]) == 0
+    assert (alone / "scene.safetensors").read_bytes() == (out / "two" / "scene.safetensors").read_bytes()
+
+    assert run(*arguments, "--shard", "1/3") == 0
+    assert "0 done, 1 skipped, 0 failed scenes" in capsys.readouterr().out
+    assert (out / "shards" / "1-of-3" / "run.json").is_file()
+
+
+@pytest.mark.parametrize(
+    ("arguments", "match"),
+    [
+        (("--do", "lift,dance"), "no 'dance'"),
+        (("--do", "lift,lift"), "twice"),
+        (("--do", "segment,lift"), "in the order"),
+        (("--do", ""), "name what to do"),
+        (("--do", "lift", "--options", "lift.color=7"), "lift.color"),
+        (("--do", "lift", "--options", "steps=7"), "steps"),
+        (("--do", "lift", "--options", "lift.tau"), "option=value"),
+        (("--do", "lift", "--options", "lift.tau=much"), "tau"),
+        (("--do", "lift", "--options", "lift.deterministic=maybe"), "true or false"),
+        (("--do", "lift", "--workers", "0"), "--workers"),
+        (("--do", "lift", "--time-limit", "0"), "--time-limit"),
+        (("--do", "lift", "--shard", "3/3"), "--shard"),
+        (("--do", "lift", "--address", "x:1"), "--engine ray"),
+    ],
+)
+def test_bad_options_are_refused_before_anything_is_done(scans, tmp_path, capsys, arguments, match):
+    assert run(scans, "--out", tmp_path / "out", *arguments) == 2
+    said = capsys.readouterr().err
+    assert match in said
+    assert len(said.splitlines()) == 1
+    assert not (tmp_path / "out").exists()
+
+
+def test_a_scene_goes_from_stage_to_stage(scans):
+    scene = Scene(
+        "one", scans / "one", {"fit.steps": "30", "steps": "50", "segment.classes": "a,b", "render.size": "7 5"}
+    )
+    stages, inputs = stages_of(scene, Plan(("fit", "lift", "predict", "segment"), {"predict.net": "net.x"}, "cpu"))
+    fit, lift, predict, segment = (parse(stage.name, stage.arguments) for stage in stages)
+    assert (fit.views, fit.steps, str(fit.out)) == (scans / "one", 30, "{out}/scene.ply")
+    assert (lift.scene, lift.views, str(lift.out)) == (fit.out, scans / "one", "{out}/scene.safetensors")
+    assert (predict.scene, str(predict.net)) == (fit.out, "net.x")
+    assert (segment.semantics, segment.predicted, segment.classes) == (lift.out, predict.out, "a,b")
+    assert inputs == (str(scans / "one"),)
+
+
+def test_fit_needs_photographs(scans):
+    with pytest.raises(InputError, match="starts from photographs"):
+        stages_of(Scene("x", scans / "one" / "scene.ply"), Plan(("fit",), {}, "cpu"))

@@ -1,0 +1,43 @@
+"""A process that does many scenes loads an encoder once."""
+
+import pytest
+
+from sgwarp.encoders import registry
+
+
+@pytest.fixture
+def made(monkeypatch):
+    """Names of the encoders that were built; each is a new object."""
+    names = []
+
+    def build(path):
+        def make(member, request):
+            names.append((member.source.name, str(request.device)))
+            return type("Source", (), {"needs_image": True, "space": "toy"})()
+
+        return make
+
+    monkeypatch.setattr(registry, "builder", build)
+    monkeypatch.setattr(registry, "_kept", None)
+    return names
+
+
+def test_encoders_are_made_anew_by_default(made):
+    assert registry.make_encoder("conse") is not registry.make_encoder("conse")
+    assert len(made) == 2
+
+
+def test_kept_encoders_are_made_once_for_each_name_and_device(made):
+    registry.keep_encoders()
+    first = registry.make_encoder("conse")
+    registry.keep_encoders()
+    assert registry.make_encoder("conse") is first
+    assert registry.make_encoder("conse", device="cuda") is not first
+    assert registry.make_encoder("clip:A+sam:B") is not registry.make_encoder("clip:A+sam:C")
+    assert len(made) == 4
+
+
+def test_files_are_never_kept(made):
+    registry.keep_encoders()
+    assert registry.make_encoder("files:labels") is not registry.make_encoder("files:labels")
+    assert len(made) == 2
