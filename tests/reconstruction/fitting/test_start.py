@@ -49,15 +49,16 @@ def test_points_beside_the_transforms_are_found(boards):
     assert abs(np.median(positions[:, 2]) - 4.0) < 0.01
 
 
-def test_nerfstudios_entry_names_the_points(copy):
+def test_nerfstudios_entry_names_the_points(copy, caplog):
     (copy / "points3D.ply").rename(copy / "cloud.ply")
     assert find_points(copy) is None
     edit(copy, lambda meta: meta.update(ply_file_path="cloud.ply"))
     assert find_points(copy) == copy / "cloud.ply"
     assert len(load_points(copy / "transforms.json")[0]) > 500
     (copy / "cloud.ply").unlink()
-    with pytest.raises(InputError, match=r"'ply_file_path' 'cloud\.ply' does not exist; copy the file"):
+    with pytest.raises(InputError, match=r"holds no points; looked for 'ply_file_path' in transforms\.json"):
         load_points(copy)
+    assert "its 'ply_file_path' 'cloud.ply' does not exist" in caplog.text
 
 
 def test_points_of_a_colmap_model(tmp_path):
