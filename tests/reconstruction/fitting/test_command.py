@@ -16,6 +16,7 @@ from sgwarp.cli import main
 from sgwarp.errors import InputError
 from sgwarp.files.images import read_rgb
 from sgwarp.io.scenes import load_gaussians
+from sgwarp.reconstruction.fitting.coverage import seen_by_any
 
 pytestmark = pytest.mark.slow
 
@@ -32,7 +33,8 @@ def test_a_folder_of_photographs_becomes_a_scene(boards, tmp_path, capsys):
     assert main(["fit", str(boards.folder), *map(str, arguments)]) == 0
     assert "held_out_psnr" in capsys.readouterr().out
     scene = load_gaussians(out)
-    assert 1000 < len(scene) <= 1200
+    assert 600 < len(scene) <= 1200  # of the wall about half lies outside all photographs
+    assert bool(seen_by_any(scene, [view.camera for view in boards.views]).all())
     run = json.loads((out.parent / "run.json").read_text())
     assert run["error"]["held_out_psnr"] > 19
     assert set(run["stages"]) == {"start", "read", "fit", "measure", "write"}
@@ -70,7 +72,7 @@ def test_a_fit_starts_from_depth(boards, tmp_path):
     assert main(["fit", str(boards.folder), "--out", str(out), *depth]) == 0
     assert len(load_gaussians(out)) > 100
     run = json.loads((tmp_path / "run.json").read_text())
-    assert "held_out_psnr" not in run["error"]
+    assert run["error"]["held_out_psnr"] is None
     assert run["outputs"] == [str(out)]
     assert run["curve"][-1]["psnr"] is None
 
@@ -79,7 +81,7 @@ def test_a_fit_starts_from_nothing(boards, tmp_path):
     out = tmp_path / "scene.ply"
     options = ["--init", "random", "--steps", "3", "--cap", "500", "--downscale", "2", "--strategy", "default"]
     assert main(["fit", str(boards.folder), "--out", str(out), *options, "--background", "random", "--exposure"]) == 0
-    assert len(load_gaussians(out)) == 500
+    assert len(load_gaussians(out)) == 250  # a random start takes half of the cap
 
 
 @pytest.mark.parametrize(
@@ -183,7 +185,7 @@ def test_a_checkpoint_that_cannot_be_written_costs_a_notice(boards, tmp_path, ca
     assert len(lines) == 2
     assert all("scene.ply.checkpoint" in line and "No space left on device" in line for line in lines)
     assert json.loads((tmp_path / "run.json").read_text())["left_out"]["checkpoints"] == 2
-    assert len(load_gaussians(out)) > 1000
+    assert len(load_gaussians(out)) > 600
     assert {path.name for path in tmp_path.iterdir()} >= {"scene.ply", "run.json"}
     assert not list(tmp_path.glob(".*"))
 
@@ -201,7 +203,7 @@ def test_a_scene_that_cannot_be_written_costs_no_run(boards, tmp_path, capsys, m
         assert main(arguments) == 2
     assert out.with_name("scene.ply.checkpoint").is_file()
     assert main([*arguments, "--resume"]) == 0
-    assert len(load_gaussians(out)) > 1000
+    assert len(load_gaussians(out)) > 600
     assert not out.with_name("scene.ply.checkpoint").exists()
 
 

@@ -19,6 +19,7 @@ from sgwarp.io.scenes import load_gaussians
 from sgwarp.ops import launcher
 from sgwarp.reconstruction.fitting.checkpoint import Checkpoint, fingerprint
 from sgwarp.reconstruction.fitting.exposure import Exposure
+from sgwarp.reconstruction.fitting.model import Model
 from sgwarp.reconstruction.fitting.photographs import read_photographs
 from sgwarp.reconstruction.fitting.settings import FitSettings
 from sgwarp.reconstruction.fitting.trainer import Fitted, fit
@@ -206,7 +207,9 @@ def test_the_mean_exposure_is_held():
 def test_checkpoints_belong_to_one_run(boards, tmp_path):
     views, path = boards.views, tmp_path / "run.checkpoint"
     photographs = read_photographs(views)
-    state = Checkpoint(asdict(QUICK), fingerprint(photographs, []), 5, 1.0, {}, {}, {}, [[0.0, 0.0]])
+    shapes = ((3,), (4,), (3,), (), (1, 3))
+    model = Model.starting(Gaussians(*(torch.full((4, *shape), 0.5) for shape in shapes))).state()
+    state = Checkpoint(asdict(QUICK), fingerprint(photographs, []), 5, 1.0, model, {}, {}, [[0.0, 0.0]])
     state.save(path)
     device = torch.device("cpu")
     assert Checkpoint.load(path, QUICK, fingerprint(photographs, []), device).step == 5
