@@ -38,15 +38,12 @@ ALLOWED = {
     ("files.tensors", "safe_open"),
     # The configuration in a folder of weights that the user names, as transformers reads it, too.
     ("encoders.weights", "json.loads"),
-    # Bounded by its own limits.
+    # Bounded by their own limits: one frame of a sequence, one image of a scene.
     ("io.archives", "zipfile.ZipFile"),
-    # To be moved to the bounded readers: torch's own weights_only, and documents without a bound on size or depth.
-    ("apps.tracking.state", "torch.load"),
-    ("apps.tracking.state", "np.load"),
-    ("apps.tracking.run", "json.loads"),
-    ("io.moving_views", "json.loads"),
-    ("io.world", "json.loads"),
-    ("reconstruction.sfm.poses", "json.loads"),
+    ("io.formats.sog", "zipfile.ZipFile"),
+    # Lines that the processes of one run send each other.
+    ("cluster.local", "json.loads"),
+    ("cluster.worker", "json.loads"),
 }
 
 
@@ -111,7 +108,15 @@ def weights(path: Path) -> object:
     return read_weights(path)
 
 
+def tracking_state(path: Path) -> object:
+    from sgwarp.apps.tracking import state
+
+    path.rename(path.with_name(state.STATE))
+    return state.load_state(path.parent, SimpleNamespace(), {})
+
+
 LOADERS = {
+    "apps.tracking.state": tracking_state,
     "encoders.maps.feature_files": features,
     "encoders.pixels.lseg": lseg,
     "io.openscene": openscene,

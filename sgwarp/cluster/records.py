@@ -22,6 +22,7 @@ from pathlib import Path
 from typing import Any
 
 from sgwarp.errors import InputError
+from sgwarp.files import documents
 from sgwarp.files.atomic import atomic_path
 
 DONE, FAILED, STAGES = "done.json", "failed.json", "stages.json"
@@ -108,8 +109,8 @@ def _same_file(handle: int, path: Path) -> bool:
 def read_json(path: Path) -> dict[str, Any]:
     """The record in a file; empty if there is none, or none that can be read."""
     try:
-        record = json.loads(path.read_text(encoding="utf-8"))
-    except (OSError, ValueError, RecursionError):
+        record = documents.read_json(path)
+    except InputError:
         return {}
     return record if isinstance(record, dict) else {}
 

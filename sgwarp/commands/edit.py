@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -96,14 +96,13 @@ class Edit(SceneOptions):
         with self.logged(self.out.parent) as log:
             from sgwarp.apps.editing.script import load_script, save_script
             from sgwarp.apps.editing.session import edit
-            from sgwarp.io.columns import read_columns
 
             gaussians = self.load_scene(log)
             steps = self._steps() if self.script is None else self._replayed(load_script(self.script, gaussians))
             context = self._context(gaussians, log)
             with log.stage("edit"):
                 state = edit(gaussians, steps, context)
-            columns = {} if self.plain else read_columns(self.scene)
+            columns = {} if self.plain else dict(gaussians.extras or {})
             with log.stage("write"):
                 script = self.out.with_name(f"{self.out.stem}.ops.json")
                 self._write(state, columns)
@@ -119,7 +118,7 @@ class Edit(SceneOptions):
         from sgwarp.io.columns import write_with_columns
         from sgwarp.io.scenes import save_gaussians
 
-        gaussians, rows = state.gaussians.to("cpu"), state.rows.cpu().numpy()
+        gaussians, rows = replace(state.gaussians.to("cpu"), extras=None), state.rows.cpu().numpy()
         if columns and not self.out.name.endswith(".compressed.ply"):
             write_with_columns(gaussians, self.out, {name: column[rows] for name, column in columns.items()})
         else:

@@ -19,8 +19,9 @@ import torch
 from torch import Tensor
 
 from sgwarp.errors import InputError
-from sgwarp.files.access import reading
 from sgwarp.files.atomic import atomic_path
+from sgwarp.files.documents import parse_json
+from sgwarp.files.tensors import read_tensors
 from sgwarp.io.columns import write_with_columns
 from sgwarp.scene import Gaussians, Instance, InstanceMap
 
@@ -83,8 +84,8 @@ def load_instances(path: str | os.PathLike[str], gaussians: Gaussians | None = N
             candidates=tensors["candidates"],
             shares=tensors["shares"].to(torch.float32),
             observations=tensors["observations"].to(torch.float32),
-            table=tuple(_row(row) for row in json.loads(metadata["table"])),
-            levels=tuple(map(str, json.loads(metadata["levels"]))),
+            table=tuple(_row(row) for row in parse_json("table", metadata["table"])),
+            levels=tuple(map(str, parse_json("levels", metadata["levels"]))),
             fingerprint=metadata["fingerprint"],
             least_confidence=float(metadata["least_confidence"]),
             features=tensors.get("features"),
@@ -113,24 +114,15 @@ def _row(row: Mapping[str, Any]) -> Instance:
 
 
 def _read(path: str | os.PathLike[str]) -> tuple[dict[str, str], dict[str, Tensor]]:
-    from safetensors import SafetensorError, safe_open
-
-    try:
-        with reading(path), safe_open(os.fspath(path), framework="pt") as content:
-            metadata = content.metadata() or {}
-            if metadata.get("format") != FORMAT:
-                raise InputError(f"{path}: holds other tensors than instances; give the output of `sgwarp instances`")
-            if metadata.get("version") != str(VERSION):
-                version = metadata.get("version")
-                raise InputError(f"{path}: has version {version}, this program reads {VERSION}; update it")
-            names = set(content.keys())
-            missing = sorted(set(TENSORS) - names)
-            if missing:
-                raise InputError(f"{path}: lacks the tensors {', '.join(missing)}; find the instances again")
-            wanted = [*TENSORS, *(["features"] if "features" in names else [])]
-            return metadata, {name: content.get_tensor(name) for name in wanted}
-    except SafetensorError as error:
-        raise InputError(f"{path}: is not a safetensors file, or is cut short ({error})") from None
+    metadata, tensors = read_tensors(path, {*TENSORS, "features"})
+    if metadata.get("format") != FORMAT:
+        raise InputError(f"{path}: holds other tensors than instances; give the output of `sgwarp instances`")
+    if metadata.get("version") != str(VERSION):
+        raise InputError(f"{path}: has version {metadata.get('version')}, this program reads {VERSION}; update it")
+    missing = sorted(set(TENSORS) - set(tensors))
+    if missing:
+        raise InputError(f"{path}: lacks the tensors {', '.join(missing)}; find the instances again")
+    return metadata, tensors
 
 
 def save_table(found: InstanceMap, path: str | os.PathLike[str]) -> None:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import os
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -12,7 +11,7 @@ import numpy as np
 import torch
 
 from sgwarp.errors import InputError
-from sgwarp.files.access import read_bytes
+from sgwarp.files.documents import read_json
 from sgwarp.io.colmap import find_model
 from sgwarp.io.stems import IMAGE_SUFFIXES
 from sgwarp.io.views import TRANSFORMS, load_views
@@ -115,10 +114,7 @@ class MetaViews:
 
     def __init__(self, path: Path, photographs: bool = True) -> None:
         self.path, self._photographs = path, photographs
-        try:
-            meta = json.loads(read_bytes(path))
-        except (ValueError, RecursionError) as error:
-            raise InputError(f"{path}: is not valid JSON ({error}); copy or export it again") from None
+        meta = read_json(path)
         names = ("w", "h", "k", "w2c")
         missing = [name for name in names if not isinstance(meta, dict) or name not in meta]
         if missing:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import os
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -11,6 +10,7 @@ from typing import Any
 
 from sgwarp.errors import InputError
 from sgwarp.files.access import reading
+from sgwarp.files.documents import read_json
 from sgwarp.io.compressed_ply import gaussians_from_packed, is_compressed, write_compressed_ply
 from sgwarp.io.formats.axes import GLTF_AXES, PLY_AXES, SPZ_AXES, change_axes, parse_axes
 from sgwarp.io.formats.dot_splat import read_splat, write_splat
@@ -122,8 +122,8 @@ def _read_suffixes() -> str:
 
 def _describe_json(path: str | os.PathLike[str]) -> str:
     try:
-        meta = json.loads(Path(path).read_bytes())
-    except (ValueError, RecursionError, OSError):
+        meta = read_json(path)
+    except InputError:
         meta = None
     if isinstance(meta, dict) and "frames" in meta:
         return "holds cameras, not a scene; give the scene, and the cameras with --views"

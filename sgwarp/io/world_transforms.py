@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import os
 from collections.abc import Sequence
 from dataclasses import replace
@@ -16,6 +15,7 @@ from numpy.typing import NDArray
 from sgwarp.errors import InputError
 from sgwarp.files.access import read_bytes
 from sgwarp.files.arrays import read_array
+from sgwarp.files.documents import parse_json
 from sgwarp.scene import View
 
 TOLERANCE = 1e-3
@@ -36,8 +36,8 @@ def read_world_transform(path: str | os.PathLike[str]) -> NDArray[np.float64]:
         return _checked(path, read_array(path), 1.0)
     text = read_bytes(path).decode("utf-8", "replace")
     try:
-        content = json.loads(text)
-    except (ValueError, RecursionError):
+        content = parse_json(path, text)
+    except InputError:  # four rows of numbers, then
         content = [line.replace(",", " ").split() for line in text.splitlines() if line.strip()]
     if isinstance(content, dict):
         return _checked(path, content.get("transform"), content.get("scale", 1.0))

@@ -398,7 +398,7 @@ def test_damaged_scripts(stage, tmp_path):
         load_script(path, stage.gaussians.subset(torch.arange(5)))
     good = json.loads(path.read_text())
     cases = [
-        ("{", "is not JSON"),
+        ("{", "is not valid JSON"),
         (json.dumps([1]), "is no edit script"),
         (json.dumps(good | {"version": 2}), "has version 2"),
         (json.dumps(good | {"steps": []}), "expected a list"),

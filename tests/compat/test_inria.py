@@ -154,7 +154,7 @@ def test_gradients_match_central_differences(raw, assert_central_differences, gi
         axes = reference.rotation_matrices(t["quats"].double()) * t["scales"].double()[:, None]
         upper = (axes @ axes.transpose(1, 2)).flatten(1)[:, [0, 1, 2, 4, 5, 8]]
         shape = {"cov3D_precomp": upper.float()}
-    image, _ = GaussianRasterizer(settings._replace(bg=t["bg"]))(
+    image, *_ = GaussianRasterizer(settings._replace(bg=t["bg"]))(
         means3D=t["means"],
         means2D=t["means2D"],
         opacities=t["opacities"],

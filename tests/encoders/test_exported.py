@@ -112,7 +112,7 @@ def test_identity_is_the_files_content(tmp_path, view):
 @pytest.mark.parametrize(
     ("content", "message"),
     [
-        ("{", "is not JSON"),
+        ("{", "is not valid JSON"),
         ("[]", r"expected \{\"instances\""),
         (json.dumps({"instances": [{"box": [0, 0, 1], "name": "a", "score": 1}]}), "an instance is damaged"),
         (json.dumps({"instances": [{"box": [0, 0, 1, 1], "score": 1}]}), "an instance is damaged .*name"),
@@ -160,7 +160,7 @@ def test_missing_instances(tmp_path, view, image):
     with pytest.raises(MissingMap, match=r"holds no a\.json or a\.npz"):
         source.find(view, image)
     (tmp_path / "a.npz").write_bytes(b"PK\x03\x04 and so on")
-    with pytest.raises(InputError, match=r"is not an \.npz of arrays"):
+    with pytest.raises(InputError, match=r"a\.npz: is no archive, or is damaged"):
         source.find(view, image)
     np.savez(tmp_path / "a.npz", boxes=np.zeros((1, 4)))
     with pytest.raises(InputError, match="lacks the array names"):
@@ -273,7 +273,7 @@ def test_missing_masks(tmp_path, view, image):
     with pytest.raises(MissingMap):
         FileMasks(tmp_path).everything(view, image)
     (tmp_path / "a.npz").write_bytes(b"PK\x03\x04 and so on")
-    with pytest.raises(InputError, match=r"is not an \.npz of arrays"):
+    with pytest.raises(InputError, match=r"a\.npz: is no archive, or is damaged"):
         FileMasks(tmp_path).everything(view, image)
 
 

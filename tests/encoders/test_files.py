@@ -195,7 +195,7 @@ def test_files_cut_short(tmp_path, suffix, share):
     write(path, features())
     data = path.read_bytes()
     path.write_bytes(data[: int(share * len(data))])
-    with pytest.raises(InputError, match=rf"a\{suffix}: is not a"):
+    with pytest.raises(InputError, match=rf"a\{suffix}: is (not a|no archive|empty|cut short)"):
         FileMaps(tmp_path, VIEWS)
 
 
@@ -206,11 +206,11 @@ class Payload:
 
 def test_pickled_code_is_not_run(tmp_path, capsys):
     torch.save({"features": Payload()}, tmp_path / "a.pt")
-    with pytest.raises(InputError, match=r"a\.pt: is not a"):
+    with pytest.raises(InputError, match=r"a\.pt: holds nothing; store one array"):
         FileMaps(tmp_path, VIEWS)
     np.save(tmp_path / "a.npy", np.array([Payload()], dtype=object), allow_pickle=True)
     (tmp_path / "a.pt").unlink()
-    with pytest.raises(InputError, match=r"a\.npy: is not a NumPy array of numbers"):
+    with pytest.raises(InputError, match=r"a\.npy: holds object; expected numbers"):
         FileMaps(tmp_path, VIEWS)
     assert capsys.readouterr().out == ""
 

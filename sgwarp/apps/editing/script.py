@@ -6,14 +6,13 @@ import json
 import os
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass
-from pathlib import Path
 from typing import Any
 
 from sgwarp.apps.editing.operations import Operation, operation_content, operation_from
 from sgwarp.apps.editing.selection import Selection, selection_from
 from sgwarp.errors import InputError
-from sgwarp.files.access import read_bytes
 from sgwarp.files.atomic import atomic_path
+from sgwarp.files.documents import read_json
 from sgwarp.scene import Gaussians
 
 FORMAT = "sgwarp-edit"
@@ -73,10 +72,7 @@ def load_script(path: str | os.PathLike[str], gaussians: Gaussians | None = None
     Raises:
         InputError: The file is missing or no script, a step does not fit, or it was made for another scene.
     """
-    try:
-        content = json.loads(read_bytes(Path(path)))
-    except ValueError as error:
-        raise InputError(f"{path}: is not JSON ({error})") from None
+    content = read_json(path)
     if not isinstance(content, dict) or content.get("format") != FORMAT:
         raise InputError(f'{path}: is no edit script; it must hold "format": "{FORMAT}"')
     if content.get("version") != VERSION:

@@ -16,9 +16,8 @@ from torch import Tensor
 from sgwarp.apps.tracking import pictures, state
 from sgwarp.apps.tracking.answers import Answer, Questions, answer
 from sgwarp.apps.tracking.tracker import TrackedFrame, Tracker, count_frames, views_at
-from sgwarp.errors import InputError
-from sgwarp.files.access import read_bytes
 from sgwarp.files.atomic import atomic_path
+from sgwarp.files.documents import read_json
 from sgwarp.files.images import write_ids, write_rgb
 from sgwarp.io.moving_views import FrameView, MovingViews
 from sgwarp.io.sequences import GaussianSequence
@@ -174,13 +173,8 @@ def _draw(folder: Path, drawn: Sequence[Path], tracks: dict[str, Any], log: RunL
 
 
 def _read_row(path: Path) -> dict[str, Any]:
-    try:
-        row: dict[str, Any] = json.loads(read_bytes(path))
-        return row
-    except ValueError as error:
-        if isinstance(error, InputError):
-            raise
-        raise InputError(f"{path}: is damaged ({error}); track again without --resume") from None
+    row: dict[str, Any] = read_json(path, "track again without --resume")
+    return row
 
 
 def gather(rows: Sequence[dict[str, Any]]) -> dict[str, Any]:

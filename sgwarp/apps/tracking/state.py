@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import pickle
 from pathlib import Path
 from typing import Any
 
@@ -14,8 +13,9 @@ from sgwarp.apps.tracking.fusion import Evidence, Fusion
 from sgwarp.apps.tracking.sources import LabelFrames
 from sgwarp.apps.tracking.tracker import TrackedFrame, Tracker
 from sgwarp.errors import InputError
-from sgwarp.files.access import reading
+from sgwarp.files.arrays import read_arrays
 from sgwarp.files.atomic import atomic_path
+from sgwarp.files.torch_files import load_torch
 
 FORMAT = 1
 STATE = "state.pt"
@@ -45,8 +45,7 @@ def load_state(folder: Path, tracker: Tracker, settings: dict[str, Any]) -> tupl
     if not path.is_file():
         return None
     try:
-        with reading(path):
-            content = torch.load(path, weights_only=True)
+        content = load_torch(path)
         if content["format"] != FORMAT:
             raise InputError(f"{path}: is of format {content['format']}, this version knows {FORMAT}; start anew")
         frame, stored, channels = int(content["frame"]), content["settings"], content["channels"]
@@ -54,7 +53,7 @@ def load_state(folder: Path, tracker: Tracker, settings: dict[str, Any]) -> tupl
         space, labels = str(content["space"]), content["labels"]
     except InputError:
         raise
-    except (RuntimeError, ValueError, KeyError, TypeError, EOFError, pickle.UnpicklingError) as error:
+    except (RuntimeError, ValueError, KeyError, TypeError) as error:
         raise InputError(f"{path}: is damaged ({type(error).__name__}); start anew without --resume") from None
     for name in sorted({*stored, *settings}):
         if stored.get(name) != settings.get(name):
@@ -118,10 +117,10 @@ def read_features(folder: Path, frame: int) -> Any:
     for index in range(frame + 1):
         path = folder / f"{index:05d}.npz"
         try:
-            with reading(path), np.load(path) as stored:
-                if bool(stored["whole"]):
-                    found = np.zeros(tuple(stored["shape"]), np.float16)
-                found[stored["rows"]] = stored["features"]
+            stored = read_arrays(path)
+            if bool(stored["whole"]):
+                found = np.zeros(tuple(stored["shape"]), np.float16)
+            found[stored["rows"]] = stored["features"]
         except InputError:
             raise
         except (ValueError, KeyError, IndexError, TypeError, EOFError) as error:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import base64
 import binascii
-import json
 import os
 import struct
 from collections.abc import Mapping
@@ -18,6 +17,7 @@ from numpy.typing import NDArray
 
 from sgwarp.errors import InputError
 from sgwarp.files.access import read_bytes
+from sgwarp.files.documents import parse_json
 
 MAGIC, JSON, BIN = b"glTF", 0x4E4F534A, 0x004E4942
 COMPONENTS = {5120: "i1", 5121: "u1", 5122: "<i2", 5123: "<u2", 5125: "<u4", 5126: "<f4"}
@@ -109,10 +109,7 @@ def read_document(path: str | os.PathLike[str]) -> Document:
     """
     path, data = Path(path), read_bytes(path)
     text, body = (data, None) if data[:4] != MAGIC else _chunks(path, data)
-    try:
-        meta = json.loads(text)
-    except (ValueError, RecursionError) as error:
-        raise InputError(f"{path}: its JSON is damaged ({str(error).splitlines()[0]})") from None
+    meta = parse_json(path, text)
     if not isinstance(meta, dict) or not isinstance(meta.get("asset"), dict):
         raise InputError(f"{path}: is not a glTF file (no 'asset' in its JSON)")
     buffers = []

@@ -12,7 +12,6 @@ Source: the format's page at developer.playcanvas.com and playcanvas/splat-trans
 
 from __future__ import annotations
 
-import json
 import os
 import struct
 import zipfile
@@ -26,6 +25,7 @@ from numpy.typing import NDArray
 
 from sgwarp.errors import InputError
 from sgwarp.files.access import read_bytes, reading
+from sgwarp.files.documents import parse_json
 from sgwarp.io.formats.axes import PLY_AXES, change_axes
 from sgwarp.io.ply import build_gaussians
 from sgwarp.scene import Gaussians
@@ -92,8 +92,8 @@ class _Meta:
     def __init__(self, path: Path, data: bytes) -> None:
         self.path = path
         try:
-            meta = json.loads(data) if len(data) <= LARGEST_META else None
-        except (ValueError, RecursionError):
+            meta = parse_json(path, data) if len(data) <= LARGEST_META else None
+        except InputError:
             meta = None
         if not isinstance(meta, dict) or not isinstance(meta.get("means"), dict):
             raise InputError(f"{path}: its meta.json is damaged, or not that of a SOG scene")

@@ -15,6 +15,7 @@ from typing import Any
 from sgwarp.errors import InputError
 from sgwarp.files.access import reading
 from sgwarp.files.atomic import atomic_path
+from sgwarp.files.documents import read_json
 from sgwarp.io.stems import IMAGE_SUFFIXES
 from sgwarp.reconstruction.sfm.features import (
     SfmSettings,
@@ -231,8 +232,8 @@ def _fingerprint(folder: Path, names: Sequence[str], settings: SfmSettings) -> s
 
 def _read_notes(out: Path) -> dict[str, Any]:
     try:
-        notes = json.loads((out / NOTES).read_text(encoding="utf-8"))
-    except (OSError, ValueError):
+        notes = read_json(out / NOTES)
+    except InputError:
         return {}
     return notes if isinstance(notes, dict) else {}
 
