@@ -71,9 +71,9 @@ plt.show()
 session = sg.EditSession(scene, context)
 session.apply(sg.EditStep(couch, Recolor(COLORS["green"])))
 session.apply(sg.EditStep(sg.Selection(("electric guitar",)), Remove()))
-session.apply(sg.EditStep(sg.Selection(("couch",)), Duplicate((0.0, -1.2, 0.0))))
-session.apply(sg.EditStep(sg.Selection(("last",), clean=False), Rotate((0.0, 0.0, 1.0), 180.0)))
-session.apply(sg.EditStep(sg.Selection(("last",), clean=False), Move((0.0, 0.0, 0.05))))
+session.apply(sg.EditStep(sg.Selection(("lamp",)), Duplicate((0.45, 0.0, 0.0))))
+session.apply(sg.EditStep(sg.Selection(("last",), clean=False), Rotate((0.0, 0.0, 1.0), 90.0)))
+session.apply(sg.EditStep(sg.Selection(("last",), clean=False), Move((0.1, 0.0, 0.0))))
 print(json.dumps([step.content for step in session.steps], indent=1))
 
 # %%
