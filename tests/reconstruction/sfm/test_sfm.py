@@ -15,6 +15,7 @@ from sgwarp.files.images import write_rgb
 from sgwarp.io.points import load_points
 from sgwarp.io.views import load_views
 from sgwarp.io.world import similarity_between
+from sgwarp.reconstruction.sfm.features import SfmSettings
 from sgwarp.reconstruction.sfm.poses import estimate_poses
 from sgwarp.reconstruction.sfm.triangulation import triangulate
 from sgwarp.reconstruction.sfm.video import extract_frames
@@ -30,7 +31,8 @@ def found(corner, tmp_path_factory):
         shutil.copy(path, folder / f"photo {path.name}")  # with a space, as cameras and people write them
     write_rgb(folder / "blank.png", np.full((192, 256, 3), 0.5))
     out = tmp_path_factory.mktemp("sfm")
-    return folder, out, estimate_poses(folder, out)
+    # With one thread COLMAP gives the same model each time.
+    return folder, out, estimate_poses(folder, out, SfmSettings(threads=1))
 
 
 def test_poses_are_those_of_the_cameras_up_to_a_similarity(corner, found):
@@ -43,7 +45,7 @@ def test_poses_are_those_of_the_cameras_up_to_a_similarity(corner, found):
     matrix = similarity_between(ours, truth)
     assert np.linalg.norm(ours @ matrix[:3, :3].T + matrix[:3, 3] - truth, axis=1).max() < 0.05
     x, _, z = (load_points(out)[0] @ matrix[:3, :3].T + matrix[:3, 3]).T
-    assert np.median(np.abs(z - 3 - np.abs(x))) < 0.03
+    assert np.median(np.abs(z - 3 - np.abs(x))) < 0.04  # a hundredth of the distance, some 4 m
 
 
 def test_a_photograph_without_pose_is_named_with_the_reason(found):
@@ -57,7 +59,7 @@ def test_a_photograph_without_pose_is_named_with_the_reason(found):
 def test_a_model_of_the_same_photographs_is_kept(found):
     folder, out, registration = found
     before = (out / "sparse/0/points3D.bin").stat().st_mtime_ns
-    assert estimate_poses(folder, out) == registration
+    assert estimate_poses(folder, out, SfmSettings(threads=1)) == registration
     assert (out / "sparse/0/points3D.bin").stat().st_mtime_ns == before
 
 
