@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -102,7 +102,7 @@ class Edit(SceneOptions):
             context = self._context(gaussians, log)
             with log.stage("edit"):
                 state = edit(gaussians, steps, context)
-            columns = {} if self.plain else dict(gaussians.extras or {})
+            columns = None if self.plain else gaussians.extras
             with log.stage("write"):
                 script = self.out.with_name(f"{self.out.stem}.ops.json")
                 self._write(state, columns)
@@ -113,16 +113,13 @@ class Edit(SceneOptions):
             print(f"{len(steps)} steps; {len(gaussians)} Gaussians before, {len(state.gaussians)} after")
             log.leave_out("gaussians_removed", max(changed, 0))
 
-    def _write(self, state: EditState, columns: dict[str, Any]) -> None:
+    def _write(self, state: EditState, columns: Mapping[str, Any] | None) -> None:
         """The new scene, with the columns of the old one where the format has room for them."""
-        from sgwarp.io.columns import write_with_columns
         from sgwarp.io.scenes import save_gaussians
 
-        gaussians, rows = replace(state.gaussians.to("cpu"), extras=None), state.rows.cpu().numpy()
-        if columns and not self.out.name.endswith(".compressed.ply"):
-            write_with_columns(gaussians, self.out, {name: column[rows] for name, column in columns.items()})
-        else:
-            save_gaussians(gaussians, self.out)
+        rows = state.rows.cpu().numpy()
+        extras = {name: column[rows] for name, column in columns.items()} if columns else None
+        save_gaussians(replace(state.gaussians.to("cpu"), extras=extras), self.out)
 
     def _replayed(self, steps: tuple[EditStep, ...]) -> tuple[EditStep, ...]:
         if self.select or self._operations():

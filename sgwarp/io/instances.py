@@ -10,7 +10,7 @@ from __future__ import annotations
 import json
 import os
 from collections.abc import Mapping
-from dataclasses import asdict, fields
+from dataclasses import asdict, fields, replace
 from pathlib import Path
 from typing import Any
 
@@ -22,7 +22,7 @@ from sgwarp.errors import InputError
 from sgwarp.files.atomic import atomic_path
 from sgwarp.files.documents import parse_json
 from sgwarp.files.tensors import read_tensors
-from sgwarp.io.columns import write_with_columns
+from sgwarp.io.ply import write_ply
 from sgwarp.scene import Gaussians, Instance, InstanceMap
 
 FORMAT = "sgwarp-instances"
@@ -154,7 +154,8 @@ def save_instance_scene(gaussians: Gaussians, found: InstanceMap, path: str | os
         "label": place[np.maximum(ids, 0)],
         "confidence": found.confidence().cpu().numpy().astype(np.float32),
     }
-    write_with_columns(gaussians, path, columns)
+    with atomic_path(path) as temporary:
+        write_ply(replace(gaussians, extras={**(gaussians.extras or {}), **columns}), temporary)
 
 
 def label_names(found: InstanceMap) -> list[str]:

@@ -1,6 +1,7 @@
 """`sgwarp instances` and `sgwarp edit` in this process: files in, files and exit codes out."""
 
 import json
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -9,9 +10,8 @@ from plyfile import PlyData
 
 from sgwarp.cli import main
 from sgwarp.files.images import read_ids
-from sgwarp.io.columns import read_columns, write_with_columns
 from sgwarp.io.instances import load_instances, save_instances
-from sgwarp.io.scenes import load_gaussians
+from sgwarp.io.scenes import load_gaussians, save_gaussians
 from sgwarp.io.store import save_semantics
 from sgwarp.lifting.lifter import lift
 
@@ -69,8 +69,8 @@ def test_the_scene_has_columns(stage_files, found):
     assert set(np.unique(rows["label"])) == {-1}
     again = load_gaussians(found.parent / "with.ply")
     assert again.fingerprint == stage_files.gaussians.fingerprint
-    assert set(read_columns(found.parent / "with.ply")) == {"instance", "label", "confidence"}
-    assert read_columns(stage_files.scene) == {}
+    assert set(again.extras) == {"instance", "label", "confidence"}
+    assert load_gaussians(stage_files.scene).extras is None
 
 
 def write_parts(stage, folder) -> None:
@@ -193,14 +193,15 @@ def test_several_operations_change_the_same_gaussians(stage, stage_files, found,
 def test_columns_of_the_old_scene_are_kept(stage, stage_files, tmp_path):
     scene = tmp_path / "columns.ply"
     number = np.arange(len(stage.classes), dtype=np.int32)
-    write_with_columns(stage_files.gaussians, scene, {"number": number, "half": (number / 2).astype(np.float64)})
+    extras = {"number": number, "half": (number / 2).astype(np.float64)}
+    save_gaussians(replace(stage_files.gaussians, extras=extras), scene)
     out = tmp_path / "o.ply"
     succeeds("edit", scene, "--out", out, "--select", "box:-9,-9,2.9,9,9,3.1", "--no-clean", "--remove")
-    columns = read_columns(out)
+    columns = load_gaussians(out).extras
     np.testing.assert_array_equal(columns["number"], number[(stage.classes != 2).numpy()])
     np.testing.assert_array_equal(columns["half"], columns["number"] / 2)
     succeeds("edit", scene, "--out", out, "--select", "box:-9,-9,2.9,9,9,3.1", "--remove", "--plain")
-    assert read_columns(out) == {}
+    assert load_gaussians(out).extras is None
 
 
 def test_edit_by_text(stage, stage_files, found, toy_text, tmp_path, monkeypatch):
