@@ -252,7 +252,8 @@ Warp instructions: what eight warps issue for one fragment of a tile. One step i
 {batches}
 
 Before: one sum of 256 pixels per thread and column, 16 channels per block, features read from global memory through
-a local frame of 1,024 bytes (backward, 16 channels), the same counting. Lifting 16 channels took {dense:.0f}.
+a local frame of 1,024 bytes (backward, 16 channels). That column was counted by
+hand in the listings of the earlier kernels; no script makes it again. Lifting 16 channels took {dense:.0f}.
 
 The backward pass of Taming 3DGS and Faster-GS, a lane per Gaussian that walks the 256 pixels of a tile, needs 287
 steps for 32 fragments: to issue as little as the two-step sum it would have {limit:.0f} instructions a step, for

@@ -1,1 +1,1 @@
-"""The name under which `sgwarp.reconstruction.fitting` was first published; kept for scripts that use it."""
+"""An earlier import path of two functions of `sgwarp.reconstruction.fitting`, kept for scripts that use it."""

@@ -58,7 +58,7 @@ class Taken:
         marks: 0 for those that wait, else 1, and 3 for those that the view has seen, uint8 [N].
         steps: Of each Gaussian since it came, this one included, int32 [N].
         waited: How many it makes up for, int32 [N]; valid where it takes the step, as the next.
-        moves: What becomes of them, see `waited_moves` in kernels/optimizing.py, float32 [N, 2].
+        moves: What becomes of them, see `waited_moves` in kernels/fitting/adam.py, float32 [N, 2].
         factors: That correct the bias of both means, and by which both fell meanwhile, float32 [N, 4].
     """
 
