@@ -190,8 +190,13 @@ class Fit(Options):
 
     def _start(self, source: Path, views: list[View], settings: FitSettings, log: RunLog) -> Any:
         """Points, a scene, or None for random points."""
-        if self.init == "depth" and self.depth is None:
+        from sgwarp.reconstruction.fitting.belongings import depth_of_views
+
+        declared = depth_of_views(views)
+        if self.init == "depth" and self.depth is None and declared is None:
             raise InputError("--init depth: needs --depth, the folder of the depth images")
+        if self.init == "auto" and self.depth is None and declared is not None:
+            logger.info("start: the data set names depth images, which are not used; --init depth starts from them")
         if self.resume or self.init == "random":  # a checkpoint holds the whole scene
             return None
         with log.stage("start"):
@@ -199,8 +204,9 @@ class Fit(Options):
                 from sgwarp.reconstruction.depth import gaussians_from_depth
                 from sgwarp.reconstruction.fitting.initial import depth_from_folder
 
-                assert self.depth is not None
-                return gaussians_from_depth(views, depth_from_folder(self.depth, views), count=settings.cap)
+                depth = declared if self.depth is None else depth_from_folder(self.depth, views)
+                assert depth is not None
+                return gaussians_from_depth(views, depth, count=settings.cap)
             if self.init in ("auto", "points") and (points := self._points(source)) is not None:
                 return points
             return self._triangulated(views, log)

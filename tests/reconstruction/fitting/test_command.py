@@ -77,6 +77,21 @@ def test_a_fit_starts_from_depth(boards, tmp_path):
     assert run["curve"][-1]["psnr"] is None
 
 
+def test_depth_that_the_data_set_names_is_offered_and_used(boards, tmp_path, capsys):
+    folder = Path(shutil.copytree(boards.folder, tmp_path / "stage"))
+    meta = json.loads((folder / "transforms.json").read_text())
+    for frame in meta["frames"]:
+        frame["depth_file_path"] = frame["file_path"].replace("images/", "depth/").replace(".png", ".npy")
+    (folder / "transforms.json").write_text(json.dumps(meta | {"depth_unit_scale_factor": 1.0}))
+    options = ["--hold-out", "0", "--cap", "900", "--steps", "2", "--out"]
+    assert main(["fit", str(folder), *options, str(tmp_path / "auto.ply")]) == 0
+    assert "--init depth starts from them" in capsys.readouterr().err
+    assert main(["fit", str(folder), *options, str(tmp_path / "named.ply"), "--init", "depth"]) == 0
+    given = ["--depth", str(boards.folder / "depth")]
+    assert main(["fit", str(boards.folder), *options, str(tmp_path / "given.ply"), *given]) == 0
+    assert (tmp_path / "named.ply").read_bytes() == (tmp_path / "given.ply").read_bytes()
+
+
 def test_a_fit_starts_from_nothing(boards, tmp_path):
     out = tmp_path / "scene.ply"
     options = ["--init", "random", "--steps", "3", "--cap", "500", "--downscale", "2", "--strategy", "default"]
