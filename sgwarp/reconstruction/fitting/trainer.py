@@ -355,29 +355,27 @@ class _Run:
 
     def measure(self) -> dict[str, float]:
         """PSNR of each held-out view, and a point of the curve."""
-        gaussians = self.model.gaussians()
-        background = torch.ones(3, device=self.device) if self.settings.background == "white" else None
-        values = {}
-        with self.log.stage("measure"):
-            for photograph in self.held_out:
-                image = rasterize(gaussians, photograph.camera, background=background).features
-                values[photograph.stem] = psnr(image, photograph.image(background), photograph.mask)
-        mean = sum(values.values()) / len(values) if values else math.nan
+        values = self._psnr_of(self.held_out)
+        mean = sum(values) / len(values) if values else math.nan
         if not self.curve or self.curve[-1].step != self.step:
-            self.curve.append(Measurement(self.step, self.seconds, mean, self.loss, len(gaussians)))
-        return values
+            self.curve.append(Measurement(self.step, self.seconds, mean, self.loss, len(self.model)))
+        return {photograph.stem: value for photograph, value in zip(self.held_out, values, strict=True)}
 
     def measure_fitted(self) -> float:
         """Mean PSNR of the views that are fitted, of at most 64 of them [dB]."""
+        values = self._psnr_of(self.photographs[:: 1 + (len(self.photographs) - 1) // MOST_MEASURED])
+        return sum(values) / len(values)
+
+    def _psnr_of(self, photographs: Sequence[Photograph]) -> list[float]:
+        """PSNR of the renderings of each photograph [dB]."""
         gaussians = self.model.gaussians()
         background = torch.ones(3, device=self.device) if self.settings.background == "white" else None
-        chosen = self.photographs[:: 1 + (len(self.photographs) - 1) // MOST_MEASURED]
         values = []
         with self.log.stage("measure"):
-            for photograph in chosen:
+            for photograph in photographs:
                 image = rasterize(gaussians, photograph.camera, background=background).features
                 values.append(psnr(image, photograph.image(background), photograph.mask))
-        return sum(values) / len(values)
+        return values
 
     def remove_unseen(self) -> None:
         """Remove the Gaussians that lie outside what the cameras can see: noise and moves have left them there."""
