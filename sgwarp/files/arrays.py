@@ -18,6 +18,7 @@ from sgwarp.files.archives import open_archive
 NUMBERS = "biufc"  # kinds of dtype: bool, signed, unsigned, floating, complex
 LAST_CODE = 0x10FFFF  # of Unicode
 MOST_AXES = 32  # of any NumPy
+LONGEST_HEADER = npy.MAGIC_LEN + 4 + (1 << 16)  # that is read [bytes]
 
 
 def read_array(path: str | os.PathLike[str]) -> NDArray[Any]:
@@ -27,7 +28,7 @@ def read_array(path: str | os.PathLike[str]) -> NDArray[Any]:
         InputError: The file is missing, damaged or cut short, or holds something other than numbers.
     """
     with open_input(path) as file:
-        dtype, shape, fortran = _header(path, file)
+        dtype, shape, fortran = read_header(path, file)
         begin, end = file.tell(), os.fstat(file.fileno()).st_size
         _check_size(path, dtype, shape, end - begin)
         with reading(path):
@@ -57,17 +58,21 @@ def parse_array(where: str, data: bytes | bytearray, texts: bool = False) -> NDA
         InputError: As `read_array`.
     """
     # Only the header goes through a stream, which would copy the rest.
-    stream = io.BytesIO(bytes(data[: npy.MAGIC_LEN + 4 + (1 << 16)]))
-    dtype, shape, fortran = _header(where, stream, texts)
+    stream = io.BytesIO(bytes(data[:LONGEST_HEADER]))
+    dtype, shape, fortran = read_header(where, stream, texts)
     _check_size(where, dtype, shape, len(data) - stream.tell())
     values = np.frombuffer(data, dtype, math.prod(shape), stream.tell())
     return _shaped(where, values if isinstance(data, bytearray) else values.copy(), shape, fortran)
 
 
-def _header(
+def read_header(
     where: str | os.PathLike[str], stream: BinaryIO, texts: bool = False
 ) -> tuple[np.dtype[Any], tuple[int, ...], bool]:
-    """Type, shape and whether columns come first; the stream is left at the first number."""
+    """Type, shape and whether columns come first, of a .npy file; the stream is left at the first number.
+
+    Raises:
+        InputError: It is damaged, or describes something other than numbers.
+    """
     try:
         version = npy.read_magic(stream)
         if version == (1, 0):

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import io
 import os
 import struct
 import zipfile
@@ -14,6 +15,7 @@ from numpy.typing import NDArray
 
 from sgwarp.errors import InputError
 from sgwarp.files.access import reading
+from sgwarp.files.arrays import LONGEST_HEADER, read_header
 
 LOCAL_HEADER = 30  # bytes of a zip member's local header before its name
 MOST_DEFLATED = 1040  # a deflated byte never stands for more bytes than this
@@ -36,17 +38,14 @@ class StackedArray:
         self._archive, self._member = archive, member
         self._stream: IO[bytes] | None = None
         with archive.open(member) as stream:
-            self.shape, self.dtype = self._header(stream)
-            self._start = stream.tell()
+            head = io.BytesIO(stream.read(LONGEST_HEADER))
+        self.shape, self.dtype = self._header(head)
+        self._start = head.tell()
         self._at = 0  # of the stream, behind the header
         self._check_size()
 
-    def _header(self, stream: IO[bytes]) -> tuple[tuple[int, ...], np.dtype[Any]]:
-        version = np.lib.format.read_magic(stream)
-        read = np.lib.format.read_array_header_1_0 if version == (1, 0) else np.lib.format.read_array_header_2_0
-        shape, fortran, dtype = read(stream)
-        if dtype.hasobject or dtype.kind not in "fiub":
-            raise InputError(f"{self.path}: array '{self.name}' holds {dtype}, expected numbers")
+    def _header(self, head: io.BytesIO) -> tuple[tuple[int, ...], np.dtype[Any]]:
+        dtype, shape, fortran = read_header(f"{self.path}: array '{self.name}'", head)
         if fortran and len(shape) > 1:
             raise InputError(f"{self.path}: array '{self.name}' is in Fortran order; save it with order C")
         return shape, dtype
@@ -135,8 +134,8 @@ def open_stacks(path: str | os.PathLike[str]) -> dict[str, StackedArray]:
     try:
         with reading(path):
             archive = zipfile.ZipFile(path)
-        members = [member for member in archive.infolist() if member.filename.endswith(".npy")]
-        arrays = [StackedArray(path, archive, member) for member in members]
+            members = [member for member in archive.infolist() if member.filename.endswith(".npy")]
+            arrays = [StackedArray(path, archive, member) for member in members]
     except InputError:
         raise
     except (zipfile.BadZipFile, zlib.error, EOFError, ValueError, NotImplementedError) as error:

@@ -147,6 +147,8 @@ class MetaViews:
             InputError: A matrix is not one, two views have one name, or the lists differ in length.
         """
         poses = self._meta["w2c"][frame]
+        if not isinstance(poses, list):
+            raise InputError(f"{self.path}: frame {frame}: 'w2c' must be a list of matrices, one per camera")
         lenses, files, names = (self._of(name, frame, len(poses)) for name in ("k", "fn", "cam_id"))
         found, seen = [], set()
         for place, (pose, lens, file, name) in enumerate(zip(poses, lenses, files, names, strict=True)):

@@ -77,7 +77,7 @@ def readers(root: Path) -> list[Reader]:
     return made
 
 
-def _folder(root: Path, name: str) -> Path:
+def folder_of(root: Path, name: str) -> Path:
     folder = root / name
     folder.mkdir(parents=True)
     return folder
@@ -86,7 +86,7 @@ def _folder(root: Path, name: str) -> Path:
 def _scenes(root: Path) -> list[Reader]:
     import plyfile
 
-    folder = _folder(root, "ply")
+    folder = folder_of(root, "ply")
     plain, packed, text = folder / "a.ply", folder / "a.compressed.ply", folder / "text.ply"
     save_gaussians(gaussians(), plain)
     save_gaussians(gaussians(), packed)
@@ -100,14 +100,14 @@ def _scenes(root: Path) -> list[Reader]:
 
 
 def _views(root: Path) -> list[Reader]:
-    folder = _folder(root, "nerfstudio")
+    folder = folder_of(root, "nerfstudio")
     cv2.imwrite(str(folder / "a.png"), image())
     frame = {"file_path": "a.png", "transform_matrix": torch.eye(4).tolist()}
     meta = {"fl_x": 20.0, "fl_y": 20.0, "cx": 8.0, "cy": 6.0, "w": WIDTH, "h": HEIGHT, "k1": 0.1, "frames": [frame] * 1}
     (folder / "transforms.json").write_text(json.dumps(meta))
     found = [Reader("transforms.json", folder / "transforms.json", lambda: load_views(folder))]
     for suffix in ("txt", "bin"):
-        model = _folder(root, f"colmap_{suffix}")
+        model = folder_of(root, f"colmap_{suffix}")
         _write_colmap(model, suffix)
         for name in ("cameras", "images"):
             read = lambda model=model: load_views(model, photographs=False)  # noqa: E731
@@ -136,7 +136,7 @@ def _write_colmap(model: Path, suffix: str) -> None:
 def _points(root: Path) -> list[Reader]:
     import plyfile
 
-    file = _folder(root, "points") / "points3D.ply"
+    file = folder_of(root, "points") / "points3D.ply"
     rows = np.array(
         [(0, 1, 2, 255, 0, 9)] * 3, dtype=[*((n, "f4") for n in "xyz"), *((n, "u1") for n in ("red", "green", "blue"))]
     )
@@ -145,7 +145,7 @@ def _points(root: Path) -> list[Reader]:
 
 
 def _images(root: Path) -> list[Reader]:
-    folder = _folder(root, "images")
+    folder = folder_of(root, "images")
     files = {
         "rgb.png": image(),
         "alpha.png": image(4),
@@ -192,7 +192,7 @@ def _maps(root: Path) -> list[Reader]:
 
     found = []
     for suffix in ("npy", "npz", "pt", "safetensors", "png"):
-        folder = _folder(root, suffix)
+        folder = folder_of(root, suffix)
         file = folder / f"a.{suffix}"
         if suffix == "npy":
             np.save(file, features)
@@ -210,11 +210,11 @@ def _maps(root: Path) -> list[Reader]:
         found.append(Reader(f"features .{suffix}", file, lambda folder=folder: read(folder)))
         if suffix == "npy":
             found.append(Reader("space.json", folder / "space.json", lambda folder=folder: read(folder)))
-    pair = _folder(root, "langsplat")
+    pair = folder_of(root, "langsplat")
     np.save(pair / "a_s.npy", (np.arange(2 * HEIGHT * WIDTH) % 4 - 1).reshape(2, HEIGHT, WIDTH).astype(np.float32))
     np.save(pair / "a_f.npy", features[:, :3, :4].reshape(-1, 4))
     found += [Reader(f"LangSplat {end}", pair / f"a_{end}.npy", lambda: read(pair)) for end in "sf"]
-    depth = _folder(root, "depth")
+    depth = folder_of(root, "depth")
     np.save(depth / "a.npy", features[0])
     return [*found, Reader("depth .npy", depth / "a.npy", lambda: depth_from_folder(depth)(view))]
 
@@ -222,19 +222,19 @@ def _maps(root: Path) -> list[Reader]:
 def _masks(root: Path) -> list[Reader]:
     view = View("a", camera())
     pixels = torch.from_numpy(image())
-    masks = _folder(root, "masks")
+    masks = folder_of(root, "masks")
     np.savez_compressed(masks / "a.npz", masks=np.ones((2, HEIGHT, WIDTH), bool), scores=np.ones(2), ranks=np.zeros(2))
     found = [Reader("masks .npz", masks / "a.npz", lambda: FileMasks(masks).everything(view, pixels))]
-    vlpart = _folder(root, "vlpart")
+    vlpart = folder_of(root, "vlpart")
     rle = {"size": [HEIGHT, WIDTH], "counts": [10, HEIGHT * WIDTH - 10]}
     row = {"box": [1, 2, 5, 6], "name": "dog:head", "score": 0.5, "mask": rle}
     (vlpart / "a.json").write_text(json.dumps({"instances": [row, row | {"mask": {**rle, "counts": "0`6"}}][:1]}))
-    boxes = _folder(root, "boxes")
+    boxes = folder_of(root, "boxes")
     np.savez(boxes / "a.npz", boxes=np.array([[1.0, 2, 5, 6]]), names=np.array(["dog"]), scores=np.ones(1))
     for folder, name in ((vlpart, "a.json"), (boxes, "a.npz")):
         read = lambda folder=folder: VLPartFiles(folder).find(view, pixels)  # noqa: E731
         found.append(Reader(f"instances {name}", folder / name, read))
-    deva = _folder(root, "deva") / "pred.json"
+    deva = folder_of(root, "deva") / "pred.json"
     frame = {"file_name": "a.jpg", "segments_info": [{"id": 1, "score": 0.5}, {"id": 2}]}
     deva.write_text(json.dumps({"annotations": [frame]}))
     return [*found, Reader("pred.json", deva, lambda: read_predictions(deva))]
@@ -242,7 +242,7 @@ def _masks(root: Path) -> list[Reader]:
 
 def _tensors(root: Path) -> list[Reader]:
     scene = gaussians()
-    folder = _folder(root, "tensors")
+    folder = folder_of(root, "tensors")
     mask = torch.tensor([True, False, True, True, False])
     torch.save({"feat": torch.randn(3, 4).half(), "mask_full": mask}, folder / "openscene.pt")
     net = {f"net.layer{k}.weight": torch.randn(3, 2) for k in range(3)}
@@ -288,10 +288,10 @@ def _checkpoint(settings: FitSettings) -> Checkpoint:
 def _others(root: Path) -> list[Reader]:
     import gzip
 
-    folder = _folder(root, "cache")
+    folder = folder_of(root, "cache")
     found = FeatureMap("mine", ids=torch.zeros(HEIGHT, WIDTH, dtype=torch.int64), vectors=torch.randn(2, 4))
     np.savez_compressed(folder / "0.map.npz", **pack(found, "0"))
-    packed = _folder(root, "gzip") / "a.gz"
+    packed = folder_of(root, "gzip") / "a.gz"
     packed.write_bytes(gzip.compress(bytes(range(256)) * 8))
 
     def cached() -> None:

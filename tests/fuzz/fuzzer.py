@@ -24,6 +24,7 @@ from collections import Counter
 from pathlib import Path
 
 os.environ.setdefault("OMP_NUM_THREADS", "1")
+from fuzz_formats import more_readers
 from fuzz_mutations import mutate
 from fuzz_readers import Reader, readers
 
@@ -125,14 +126,12 @@ def fuzz(pairs, inputs: int, seconds: float, seed: int, keep: Path | None = None
             keep.mkdir(parents=True, exist_ok=True)
             (keep / f"{reader.name.replace(' ', '_')}-{number}").write_bytes(data)
             print(f"{reader.name}, input {number}: {result}", flush=True)
+        reader.file.write_bytes(originals[reader.name])  # other readers may need it
         if number % (len(pairs) * 50) == 0:
-            reader.file.write_bytes(originals[reader.name])
             gc.collect()
         if time.monotonic() - told > every:
             told = time.monotonic()
             print(f"{number + 1} inputs, {time.monotonic() - began:.0f} s", flush=True)
-    for reader in pairs:
-        reader.file.write_bytes(originals[reader.name])
     return results
 
 
@@ -151,15 +150,20 @@ def _row(name: str, counts: Counter) -> str:
     return f"| {name} | {counts.total():,} | {counts['read']:,} | {counts['refused']:,} | {text} |"
 
 
+def all_readers(folder: Path) -> list[Reader]:
+    """Every pair of reader and file, with the files below `folder`."""
+    return readers(folder / "first") + more_readers(folder / "more")
+
+
 def require_good(pairs) -> None:
     """Every file is good before it is changed, or the fuzzer would only see how it is refused."""
     for reader in pairs:
         try:
             reader.read()
-            good = True
-        except InputError:
-            good = False
-        assert good == reader.fits, reader.name
+            refusal = None
+        except InputError as error:
+            refusal = error
+        assert (refusal is None) == reader.fits, f"{reader.name}: {refusal}"
 
 
 def quiet() -> None:
@@ -178,7 +182,7 @@ def main() -> int:
     quiet()
     base = "/dev/shm" if os.access("/dev/shm", os.W_OK) else None
     with tempfile.TemporaryDirectory(dir=base) as folder:
-        pairs = [reader for reader in readers(Path(folder)) if options.only in reader.name]
+        pairs = [reader for reader in all_readers(Path(folder)) if options.only in reader.name]
         require_good(pairs)
         limit_addresses()
         os.dup2(os.open(os.devnull, os.O_WRONLY), 2)  # image codecs tell stderr about every fault

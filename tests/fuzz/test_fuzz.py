@@ -15,9 +15,8 @@ SECONDS = 10.0
 @pytest.fixture(scope="module")
 def pairs(tmp_path_factory):
     import fuzzer
-    from fuzz_readers import readers
 
-    made = readers(tmp_path_factory.mktemp("fuzz"))
+    made = fuzzer.all_readers(tmp_path_factory.mktemp("fuzz"))
     fuzzer.require_good(made)
     return made
 

@@ -118,11 +118,20 @@ def read_features(folder: Path, frame: int) -> Any:
         path = folder / f"{index:05d}.npz"
         try:
             stored = read_arrays(path)
+            shape, rows, features = tuple(stored["shape"].tolist()), stored["rows"], stored["features"]
             if bool(stored["whole"]):
-                found = np.zeros(tuple(stored["shape"]), np.float16)
-            found[stored["rows"]] = stored["features"]
+                # A whole frame lists every row, so it cannot claim more than it holds.
+                found = np.zeros(shape, np.float16) if (len(rows), *features.shape[1:]) == shape else None
+            if found is None or not _are_rows(rows, len(found)):
+                raise InputError(f"{path}: is damaged (its rows do not fit its frame); track again")
+            found[rows] = features
         except InputError:
             raise
-        except (ValueError, KeyError, IndexError, TypeError, EOFError) as error:
+        except (ValueError, KeyError, IndexError, TypeError, EOFError, OverflowError) as error:
             raise InputError(f"{path}: is damaged ({type(error).__name__}); track again") from None
     return found
+
+
+def _are_rows(rows: Any, count: int) -> bool:
+    whole = rows.ndim == 1 and rows.dtype.kind in "iu"
+    return bool(whole and (rows.size == 0 or (rows.min() >= 0 and rows.max() < count)))

@@ -63,16 +63,20 @@ def _mapping(value: Any) -> Mapping[str, Any]:
     return value if isinstance(value, dict) else {}
 
 
+def _list(value: Any) -> list[Any]:
+    return value if isinstance(value, list) else []
+
+
 def _primitives(document: Document) -> Iterator[tuple[Mapping[str, Any], NDArray[np.float64]]]:
     """Every primitive of the scene, and the matrix of its node."""
     nodes, scenes = document.rows("nodes"), document.rows("scenes")
     roots = _mapping(scenes[0]).get("nodes") if scenes else list(range(len(nodes)))
-    waiting = [(root, np.eye(4), 0) for root in (roots if isinstance(roots, list) else [])]
+    waiting = [(root, np.eye(4), 0) for root in _list(roots)]
     seen: set[int] = set()
     if not nodes:  # meshes that no node places
         waiting = []
         for mesh in document.rows("meshes"):
-            for primitive in _mapping(mesh).get("primitives") or []:
+            for primitive in _list(_mapping(mesh).get("primitives")):
                 yield _mapping(primitive), np.eye(4)
     while waiting:
         index, above, depth = waiting.pop()
@@ -81,11 +85,10 @@ def _primitives(document: Document) -> Iterator[tuple[Mapping[str, Any], NDArray
         seen.add(index)
         node = _mapping(nodes[index])
         matrix = above @ _node_matrix(document, node)
-        children = node.get("children", [])
-        waiting += [(child, matrix, depth + 1) for child in (children if isinstance(children, list) else [])]
+        waiting += [(child, matrix, depth + 1) for child in _list(node.get("children"))]
         if "mesh" in node:
             mesh = document.row("meshes", node["mesh"])
-            for primitive in mesh.get("primitives") or []:
+            for primitive in _list(mesh.get("primitives")):
                 yield _mapping(primitive), matrix
 
 
