@@ -88,6 +88,10 @@ class Fit(Options):
     exposure: bool = False
     """Also fit an affine map of the colours for every photograph."""
 
+    refine_poses: bool = False
+    """Also fit a small motion of every camera. The poses go to OUT.refined: give that folder as --views to other
+    commands. Held-out views keep the poses that they came with."""
+
     sparse: bool = True
     """Update only what a step's view has seen."""
 
@@ -128,6 +132,7 @@ class Fit(Options):
                 sh_degree=self.sh_degree,
                 background=self.background,
                 exposure=self.exposure,
+                refine_poses=self.refine_poses,
                 sparse=self.sparse,
                 seed=self.seed,
                 evaluate_every=min(EVALUATE_EVERY, max(1, self.steps // 10)),
@@ -247,6 +252,7 @@ class Fit(Options):
         return None
 
     def _write(self, fitted: Fitted, held_out: list[View], masks: Masks | None, log: RunLog) -> None:
+        from sgwarp.io.posed_photographs import write_posed_photographs
         from sgwarp.io.scenes import save_gaussians
         from sgwarp.reconstruction.fitting.photographs import read_photographs
         from sgwarp.reconstruction.fitting.report import draw_curve, write_contact_sheet
@@ -255,6 +261,9 @@ class Fit(Options):
         with log.stage("write"):
             save_gaussians(fitted.gaussians, self.out)
             log.outputs.append(str(self.out))
+            if self.refine_poses:
+                folder = self.out.with_name(f"{self.out.name}.refined")
+                log.outputs.append(str(write_posed_photographs(folder, fitted.views)))
             if held_out:
                 sheet = self.out.with_name(f"{self.out.stem}.held_out.jpg")
                 photographs = read_photographs(

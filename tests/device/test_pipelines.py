@@ -5,7 +5,7 @@ import torch
 
 import sgwarp as sg
 from sgwarp.io.views import load_views
-from sgwarp.reconstruction.fitting import trainer
+from sgwarp.reconstruction.fitting import loop
 from sgwarp.reconstruction.fitting.settings import FitSettings
 
 STEPS = 10
@@ -31,7 +31,7 @@ def test_fit_gives_what_the_cpu_gives(settings, stage_files, tmp_path, pretended
 
 def test_a_step_waits_for_the_intersections_alone(stage_files, monkeypatch, pretended_cuda):
     seen = []
-    take_step = trainer._Run._take_step
+    take_step = loop.Loop._take_step
 
     def watched(run):
         pretended_cuda.reset()
@@ -40,7 +40,7 @@ def test_a_step_waits_for_the_intersections_alone(stage_files, monkeypatch, pret
         seen.append(([place.split(":")[0] for _, place in pretended_cuda.waits], len(pretended_cuda.launches)))
         return lambda: None
 
-    monkeypatch.setattr(trainer._Run, "_take_step", watched)
+    monkeypatch.setattr(loop.Loop, "_take_step", watched)
     fitted(stage_files, device="cuda", settings={"refine_every": 1000, "evaluate_every": 1000})
     assert len(seen) == STEPS
     assert all(waits == ["ops/splatting/tiles.py"] for waits, _ in seen)

@@ -282,7 +282,7 @@ def _checkpoint(settings: FitSettings) -> Checkpoint:
         for part in ("parameters", "first", "second", "values")
     }
     model |= {name: torch.zeros(COUNT, dtype=torch.int32) for name in ("steps", "skipped")}
-    return Checkpoint(dataclasses.asdict(settings), "0", 3, 1.5, model, {}, {}, [[0.1, 20.0], [1.0, 2.0, 3.0]])
+    return Checkpoint(dataclasses.asdict(settings), "0", 3, 1.5, model, {}, {}, {}, [[0.1, 20.0], [1.0, 2.0, 3.0]])
 
 
 def _others(root: Path) -> list[Reader]:

@@ -18,8 +18,8 @@ from sgwarp.reconstruction.fitting.photographs import Photograph
 from sgwarp.reconstruction.fitting.settings import FitSettings
 from sgwarp.scene import SH_COUNTS
 
-FORMAT = 1
-GROUPS = ("model", "strategy", "exposure")
+FORMAT = 2
+GROUPS = ("model", "strategy", "exposure", "poses")
 PARTS = ("parameters", "first", "second", "values")
 
 
@@ -32,7 +32,7 @@ class Checkpoint:
         photographs: Fingerprint of what it is fitted to.
         step: How many steps have been taken; random numbers and the order of the views follow from it and the seed.
         seconds: Spent on them.
-        model, strategy, exposure: Tensors by name.
+        model, strategy, exposure, poses: Tensors by name.
         curve: Measurements so far, rows of numbers.
     """
 
@@ -43,6 +43,7 @@ class Checkpoint:
     model: dict[str, Tensor]
     strategy: dict[str, Tensor]
     exposure: dict[str, Tensor]
+    poses: dict[str, Tensor]
     curve: list[list[float]]
 
     def save(self, path: Path) -> None:

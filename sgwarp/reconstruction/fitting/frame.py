@@ -66,3 +66,9 @@ class Frame:
         """A scene back into the world."""
         means = gaussians.means.to(torch.float64) * self.scale + self.origin.to(gaussians.device)
         return replace(gaussians, means=means.to(torch.float32), scales=gaussians.scales * self.scale)
+
+    def with_pose(self, view: View, camera: Camera) -> View:
+        """A view of the world with the pose of a camera of the frame."""
+        pose = camera.world_to_camera.clone()
+        pose[:3, 3] = pose[:3, 3] * self.scale - pose[:3, :3] @ self.origin
+        return replace(view, camera=replace(view.camera, world_to_camera=pose))

@@ -32,6 +32,7 @@ class FitSettings:
         similarity_share: Weight of D-SSIM in the loss, the rest is L1.
         sparse: Update only the Gaussians that a step's view has seen.
         exposure: Also fit an affine map of the colours for every photograph.
+        refine_poses: Also fit a small rigid motion of every camera.
         seed: Of everything random.
         evaluate_every: Steps between two measurements on the held-out views.
         refine_every: Steps between two refinements of the set of Gaussians.
@@ -52,6 +53,7 @@ class FitSettings:
     similarity_share: float = 0.2
     sparse: bool = True
     exposure: bool = False
+    refine_poses: bool = False
     seed: int = 0
     evaluate_every: int = 500
     refine_every: int = 100

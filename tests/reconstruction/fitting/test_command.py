@@ -51,6 +51,20 @@ def test_a_folder_of_photographs_becomes_a_scene(boards, tmp_path, capsys):
     assert not list(out.parent.glob("*.checkpoint"))
 
 
+def test_refined_poses_are_a_data_set(boards, tmp_path):
+    from sgwarp.io.views import load_views
+
+    out = tmp_path / "scene.ply"
+    options = ["--steps", "60", "--cap", "1200", "--sh-degree", "0", "--hold-out", "4", "--refine-poses"]
+    assert main(["fit", str(boards.folder), "--out", str(out), *options]) == 0
+    refined = load_views(tmp_path / "scene.ply.refined")
+    fitted = [view for index, view in enumerate(boards.views) if index % 4]
+    assert [view.stem for view in refined] == [view.stem for view in fitted]
+    shifts = [(one.camera.position - other.camera.position).norm() for one, other in zip(refined, fitted, strict=True)]
+    assert 0 < min(shifts) and max(shifts) < 0.1
+    assert str(tmp_path / "scene.ply.refined" / "transforms.json") in (tmp_path / "run.json").read_text()
+
+
 def test_the_contact_sheet_shows_truth_rendering_and_difference(boards, tmp_path):
     from sgwarp.reconstruction.fitting.photographs import read_photographs
     from sgwarp.reconstruction.fitting.report import write_contact_sheet

@@ -209,7 +209,7 @@ def test_checkpoints_belong_to_one_run(boards, tmp_path):
     photographs = read_photographs(views)
     shapes = ((3,), (4,), (3,), (), (1, 3))
     model = Model.starting(Gaussians(*(torch.full((4, *shape), 0.5) for shape in shapes))).state()
-    state = Checkpoint(asdict(QUICK), fingerprint(photographs, []), 5, 1.0, model, {}, {}, [[0.0, 0.0]])
+    state = Checkpoint(asdict(QUICK), fingerprint(photographs, []), 5, 1.0, model, {}, {}, {}, [[0.0, 0.0]])
     state.save(path)
     device = torch.device("cpu")
     assert Checkpoint.load(path, QUICK, fingerprint(photographs, []), device).step == 5

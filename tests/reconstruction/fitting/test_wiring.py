@@ -9,7 +9,7 @@ import torch
 
 from sgwarp.io.points import load_points
 from sgwarp.ops.adam import count_steps
-from sgwarp.reconstruction.fitting import trainer
+from sgwarp.reconstruction.fitting import loop, trainer
 from sgwarp.reconstruction.fitting.checkpoint import fingerprint
 from sgwarp.reconstruction.fitting.densify import FAINT, Densify
 from sgwarp.reconstruction.fitting.exposure import Exposure
@@ -247,10 +247,10 @@ def spied(monkeypatch):
 
         monkeypatch.setattr(owner, name, called)
 
-    spy(trainer, "rasterize_with_gradients")
-    spy(trainer, "photometric_loss")
-    spy(trainer, "psnr")
-    spy(trainer._Run, "measure")
+    spy(loop, "rasterize_with_gradients")
+    spy(loop, "photometric_loss")
+    spy(loop, "psnr")
+    spy(loop.Loop, "measure")
     spy(Model, "update")
     spy(MarkovChain, "after_step")
     spy(Exposure, "update")
@@ -353,14 +353,14 @@ def test_what_is_measured(boards, spied):
 
 def test_the_loss_that_is_reported_is_smooth(boards, monkeypatch):
     values: list[float] = []
-    original = trainer.photometric_loss
+    original = loop.photometric_loss
 
     def noted(*arguments):
         loss = original(*arguments)
         values.append(float(loss.detach()))
         return loss
 
-    monkeypatch.setattr(trainer, "photometric_loss", noted)
+    monkeypatch.setattr(loop, "photometric_loss", noted)
     result = short_fit(boards)
     smooth = values[0]
     for value in values[1:]:
@@ -376,24 +376,26 @@ def test_rotations_are_returned_as_unit_quaternions(boards):
 def test_a_checkpoint_brings_everything_back(boards, tmp_path, monkeypatch):
     """A resumed run has the model, the exposures and the strategy's counts as they were saved."""
     path = tmp_path / "run.checkpoint"
-    settings = replace(SHORT, exposure=True, strategy="default")
+    settings = replace(SHORT, exposure=True, refine_poses=True, strategy="default")
     short_fit(boards, settings, checkpoint=path, keep_checkpoint=True)
     saved = torch.load(path, weights_only=True)
     restored = {}
-    original = trainer._Run.restore
+    original = loop.Loop.restore
 
     def restore(run, *arguments):
         original(run, *arguments)
         # Copied at once: the end of a run removes Gaussians that no camera sees.
-        restored.update({part: deepcopy(getattr(run, part).state()) for part in ("model", "strategy", "exposure")})
+        parts = ("model", "strategy", "exposure", "poses")
+        restored.update({part: deepcopy(getattr(run, part).state()) for part in parts})
 
-    monkeypatch.setattr(trainer._Run, "restore", restore)
+    monkeypatch.setattr(loop.Loop, "restore", restore)
     short_fit(boards, settings, checkpoint=path, keep_checkpoint=True, resume=True)  # no step is left to take
-    assert set(restored) == {"model", "strategy", "exposure"}
+    assert set(restored) == {"model", "strategy", "exposure", "poses"}
     for part, state in restored.items():
         assert state.keys() == saved[part].keys()
         assert all(torch.equal(state[name], saved[part][name]) for name in state), part
     assert saved["exposure"]["maps"].std(dim=0).any()
+    assert saved["poses"]["maps"].std(dim=0).all()
     assert saved["strategy"]["views"].any()
 
 
