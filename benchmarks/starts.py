@@ -3,7 +3,8 @@
     SGWARP_DATA=FOLDER python -m benchmarks.starts [START ...] [--steps 1500] [--cap 30000] [--downscale 2]
 
 Each start is fitted and added to benchmarks/starts.json: PSNR of the held-out views, the gap to the fitted ones, mIoU
-of true labels lifted into the scene, and seconds. `photographs` finds the poses as well.
+of true labels lifted into the scene, and seconds. `photographs` finds the poses as well. `noisy` starts from points,
+with the poses of the fitted photographs half a degree and two centimeters off; `refined` also refines them.
 """
 
 from __future__ import annotations
@@ -13,8 +14,13 @@ import json
 import os
 import tempfile
 import time
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
+
+import cv2
+import numpy as np
+import torch
 
 import sgwarp as sg
 from benchmarks.room import HOLD_OUT, FullRoom, label_iou
@@ -26,7 +32,8 @@ from sgwarp.reconstruction.sfm.features import SfmSettings
 from sgwarp.reconstruction.sfm.poses import estimate_poses
 from sgwarp.reconstruction.sfm.triangulation import triangulate
 
-STARTS = ("depth", "points", "photographs", "triangulated", "random")
+STARTS = ("depth", "points", "photographs", "triangulated", "random", "noisy", "refined")
+DEGREES, METERS = 0.5, 0.02  # of noise
 EVALUATIONS = 5
 
 
@@ -40,9 +47,22 @@ def begin(start: str, folder: Path, work: Path, settings: FitSettings) -> tuple[
     kept = [view for index, view in enumerate(views) if index % HOLD_OUT]
     if start == "depth":
         return views, sg.gaussians_from_depth(kept, depth_from_folder(folder / "depth"), count=settings.cap)
-    if start == "points":
+    if start in ("points", "noisy", "refined"):
         return views, sg.load_points(folder)
     return views, triangulate(kept, sfm) if start == "triangulated" else None
+
+
+def shaken(views: list[sg.View], seed: int = 0) -> list[sg.View]:
+    """The views with every camera turned by DEGREES about a random axis, and moved METERS in a random direction."""
+    random = np.random.default_rng(seed)
+    found = []
+    for view in views:
+        axis, shift = (vector / np.linalg.norm(vector) for vector in random.normal(size=(2, 3)))
+        noise = np.eye(4)
+        noise[:3, :3], noise[:3, 3] = cv2.Rodrigues(np.radians(DEGREES) * axis)[0], METERS * shift
+        pose = torch.from_numpy(noise) @ view.camera.world_to_camera
+        found.append(replace(view, camera=replace(view.camera, world_to_camera=pose)))
+    return found
 
 
 def measure(start: str, folder: Path, settings: FitSettings, downscale: int) -> dict[str, float]:
@@ -52,7 +72,11 @@ def measure(start: str, folder: Path, settings: FitSettings, downscale: int) -> 
         views, first = begin(start, folder, Path(work), settings)
         held_out = views[::HOLD_OUT]
         kept = [view for index, view in enumerate(views) if index % HOLD_OUT]
+        if start in ("noisy", "refined"):
+            kept = shaken(kept)
+        settings = replace(settings, refine_poses=start == "refined")
         fitted = sg.fit(kept, first, held_out, settings, downscale=downscale)
+        kept = list(fitted.views)
         seconds = time.perf_counter() - began
         names = json.loads((folder / "classes.json").read_text())
         named = tuple(names[str(number)] for number in range(1, len(names)))
