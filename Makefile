@@ -6,6 +6,9 @@
 VENV := .venv
 BIN := $(VENV)/bin
 ARGS ?=
+# Tests run in so many processes, files as a whole; WORKERS=0 runs them in one, for a debugger.
+WORKERS ?= 2
+PYTEST := OMP_NUM_THREADS=1 $(BIN)/python -m pytest -n $(WORKERS) --dist loadfile
 SOURCES := $(wildcard sgwarp kernels tests notebooks benchmarks tools)
 
 # A name on PATH may be an empty shim, so each candidate has to run.
@@ -25,10 +28,10 @@ help:
 	@echo "make clean      remove what the other targets built"
 
 test: $(VENV)/installed-test
-	$(BIN)/python -m pytest $(ARGS)
+	$(PYTEST) $(ARGS)
 
 test-fast: $(VENV)/installed-test
-	$(BIN)/python -m pytest -m "not slow" $(ARGS)
+	$(PYTEST) -m "not slow" $(ARGS)
 
 demo: $(VENV)/installed-demo
 	$(BIN)/sgwarp demo --out demo_out $(ARGS)
