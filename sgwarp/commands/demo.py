@@ -6,6 +6,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from sgwarp.commands.options import Options, check_folder
+from sgwarp.runs.progress import show_progress
 
 
 @dataclass(kw_only=True)
@@ -20,4 +21,4 @@ class Demo(Options):
         self.start()
         from sgwarp.demo.run import run_demo
 
-        run_demo(self.out, device=self.device)
+        run_demo(self.out, device=self.device, show=show_progress)

@@ -14,6 +14,7 @@ import tyro
 
 from sgwarp.errors import InputError
 from sgwarp.runs.log import RunLog
+from sgwarp.runs.progress import show_progress
 
 if TYPE_CHECKING:
     from torch import Tensor
@@ -59,7 +60,7 @@ class Options:
             find_device(self.device)
         except InputError as error:
             raise InputError(f"--{error}") from None
-        return RunLog(command=self.command_line, device=self.device, threads=get_threads())
+        return RunLog(command=self.command_line, device=self.device, threads=get_threads(), show=show_progress)
 
 
 @dataclass(kw_only=True)

@@ -27,7 +27,7 @@ from sgwarp.lifting.lifter import lift
 from sgwarp.ops.launcher import get_threads, set_threads
 from sgwarp.ops.splatting.forward import rasterize
 from sgwarp.runs.log import RunLog
-from sgwarp.runs.progress import show_progress
+from sgwarp.runs.progress import ShowProgress, hide_progress
 from sgwarp.scene import FeatureMap, View
 
 ENCODER = "conse"
@@ -41,7 +41,7 @@ PICTURES = {
 }
 
 
-def run_demo(out: Path, threads: int | None = None, device: str = "cpu") -> RunLog:
+def run_demo(out: Path, threads: int | None = None, device: str = "cpu", show: ShowProgress = hide_progress) -> RunLog:
     """Lift the default encoder's semantics into the room, ask for its furniture, measure, draw and report.
 
     Writes the PICTURES, report.md and run.json, and prints the report.
@@ -50,6 +50,7 @@ def run_demo(out: Path, threads: int | None = None, device: str = "cpu") -> RunL
         out: Folder to write into.
         threads: Host threads; all cores if None.
         device: Where to compute.
+        show: Shows the progress of its stages.
 
     Returns:
         The log as written; its `error` holds `miou` (of the furniture), `localised` (of 11 objects), `coverage` and
@@ -69,14 +70,14 @@ def run_demo(out: Path, threads: int | None = None, device: str = "cpu") -> RunL
     # layer, which on a busy machine takes longer than the layer.
     torch.set_num_threads(1)
     try:
-        return _run(out, device)
+        return _run(out, device, show)
     finally:
         set_threads(threads_before[0])
         torch.set_num_threads(threads_before[1])
 
 
-def _run(out: Path, device: str) -> RunLog:
-    log = RunLog(command="sgwarp demo", device=device, threads=get_threads())
+def _run(out: Path, device: str, show: ShowProgress) -> RunLog:
+    log = RunLog(command="sgwarp demo", device=device, threads=get_threads(), show=show)
     with log.stage("read"):
         room = Room.load().to(device)
     with log.stage("load_encoder"):
@@ -111,7 +112,7 @@ def _run(out: Path, device: str) -> RunLog:
 def _encode(room: Room, source: MapSource, log: RunLog) -> dict[str, FeatureMap]:
     """Feature map of each view."""
     maps = {}
-    with log.stage("encode"), show_progress("encode") as report, ThreadPoolExecutor(get_threads()) as pool:
+    with log.stage("encode"), log.show("encode") as report, ThreadPoolExecutor(get_threads()) as pool:
         encoded = pool.map(lambda view: source.encode(view, view.image()), room.views)
         for done, (view, feature_map) in enumerate(zip(room.views, encoded, strict=True), start=1):
             maps[view.stem] = feature_map

@@ -11,6 +11,7 @@ from dataclasses import asdict, dataclass, field
 from pathlib import Path
 
 from sgwarp.files.atomic import atomic_path
+from sgwarp.runs.progress import ShowProgress, hide_progress
 from sgwarp.version import __version__
 
 
@@ -28,6 +29,7 @@ class RunLog:
         error: The run's own error figures.
         outputs: Files written.
         curve: How a run that improves step by step got there, one row of numbers per measurement; else left out.
+        show: Shows the progress of a stage, as `with log.show(title) as report`; nothing by default. Not written.
     """
 
     command: str = ""
@@ -39,6 +41,7 @@ class RunLog:
     error: dict[str, float] = field(default_factory=dict)
     outputs: list[str] = field(default_factory=list)
     curve: list[dict[str, float]] = field(default_factory=list)
+    show: ShowProgress = field(default=hide_progress, repr=False)
 
     @contextmanager
     def stage(self, name: str, wait: bool = True) -> Iterator[None]:
@@ -65,6 +68,7 @@ class RunLog:
     def write(self, folder: Path) -> Path:
         """Write `run.json` into `folder`, whole or not at all; numbers that are not finite become null."""
         record = asdict(self)
+        del record["show"]
         record["stages"] = {name: round(seconds, 4) for name, seconds in self.stages.items()}
         record["error"] = _finite(self.error)
         record["curve"] = [_finite(row) for row in self.curve]

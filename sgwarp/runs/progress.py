@@ -5,14 +5,21 @@ from __future__ import annotations
 import sys
 import time
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import AbstractContextManager, contextmanager
 from typing import TextIO
 
 from sgwarp.errors import printable
 
 Report = Callable[[int, int, str], None]  # items done, items in all, name of the item at work
 
+ShowProgress = Callable[[str], AbstractContextManager[Report]]  # takes the title of what goes on in the block
 LOG_INTERVAL = 30.0  # seconds between two lines in a log file
+
+
+@contextmanager
+def hide_progress(title: str) -> Iterator[Report]:
+    """Show nothing: what library code does unless its caller wants otherwise."""
+    yield lambda done, total, name: None
 
 
 @contextmanager

@@ -5,6 +5,7 @@ import json
 import math
 import sys
 import time
+from contextlib import contextmanager
 
 import pytest
 
@@ -94,3 +95,18 @@ def test_without_rich_a_terminal_gets_a_line(monkeypatch):
     assert written.split("\r")[2] == "lift 2/2 b".ljust(len("lift 1/2 a long name"))  # covers the longer line
     assert written.endswith("\r")
     assert "\n" not in written
+
+
+def test_a_log_shows_nothing_unless_it_is_told_how(tmp_path, capsys):
+    shown = []
+
+    @contextmanager
+    def show(title):
+        yield lambda done, total, name: shown.append((title, done, total, name))
+
+    for log in (RunLog(), RunLog(show=show)):
+        with log.show("lift") as report:
+            report(1, 2, "a")
+        assert "show" not in json.loads(log.write(tmp_path).read_text())
+    assert shown == [("lift", 1, 2, "a")]
+    assert capsys.readouterr() == ("", "")

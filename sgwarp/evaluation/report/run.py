@@ -17,7 +17,7 @@ from sgwarp.evaluation.report.stability import Schedule, check, check_gradients
 from sgwarp.evaluation.report.sweep import Trial, rendering_variants, sweep_lifting, sweep_rendering
 from sgwarp.ops.launcher import get_threads
 from sgwarp.runs.log import RunLog
-from sgwarp.runs.progress import show_progress
+from sgwarp.runs.progress import ShowProgress, hide_progress
 from sgwarp.scene import FeatureMap, Gaussians, View
 
 
@@ -76,7 +76,7 @@ def make_report(
     views = [view for view in views if view.stem in maps] if maps else views
     train, measured = split_views(views, held_out)
 
-    with log.stage("oracle"), show_progress("oracle") as progress:
+    with log.stage("oracle"), log.show("oracle") as progress:
         on_cpu, limit, rounding = gaussians.to("cpu"), [], 0.0
         _, _, draw = rendering_variants(gaussians, seed)[0]
         progress(0, len(measured), "")
@@ -85,11 +85,11 @@ def make_report(
             same = see_patches(on_cpu, view, patches, SAME, seed).rounding(draw(view.camera).cpu())
             rounding = max(rounding, float(same.max()) if same.numel() else 0.0)
             progress(done, len(measured), view.stem)
-    with log.stage("rendering"), show_progress("rendering") as progress:
+    with log.stage("rendering"), log.show("rendering") as progress:
         rendering = sweep_rendering(gaussians, measured, limit, repeats, seed, progress)
     lifting: list[Trial] = []
     if maps:
-        with log.stage("lifting"), show_progress("lifting") as progress:
+        with log.stage("lifting"), log.show("lifting") as progress:
             lifting = sweep_lifting(gaussians, train, measured, maps, repeats, progress)
     about = {
         "scene": name,
@@ -108,7 +108,7 @@ def make_report(
     }
     findings = Findings(about, rounding, rendering, lifting)
     with log.stage("extremes"):
-        findings.stability = check_extremes(extremes, gaussians.device)
+        findings.stability = check_extremes(extremes, gaussians.device, log.show)
 
     log.error |= {f"default_{key}": value for key, value in rendering[0].errors.items()}
     log.error["rounding"] = rounding
@@ -124,11 +124,13 @@ def make_report(
     return findings
 
 
-def check_extremes(names: Sequence[str], device: torch.device | str = "cpu") -> list[Stability]:
+def check_extremes(
+    names: Sequence[str], device: torch.device | str = "cpu", show: ShowProgress = hide_progress
+) -> list[Stability]:
     """Images and gradients of the extreme scenes: on the CPU in both schedules, elsewhere in that of the device."""
     results = []
     schedules: tuple[Schedule, ...] = ("lanes", "block") if torch.device(device).type == "cpu" else ("block",)
-    with show_progress("extremes") as progress:
+    with show("extremes") as progress:
         progress(0, len(names), "")
         for done, name in enumerate(names, start=1):
             extreme = EXTREMES[name]
