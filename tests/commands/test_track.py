@@ -1,15 +1,19 @@
 """`sgwarp track` on files in Dynamic3DGaussians' layout: what it writes, and that a killed run ends the same."""
 
 import json
+from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 
 from sgwarp.apps.tracking import run as tracking_run
+from sgwarp.apps.tracking.association import Associated
 from sgwarp.apps.tracking.state import read_features
 from sgwarp.cli import main
 from sgwarp.datasets.moving import LABELS, make_moving_scene
 from sgwarp.datasets.moving_files import save_moving_scene
+from sgwarp.errors import InputError
 from sgwarp.files.images import read_ids, read_rgb
 from sgwarp.io.scenes import save_gaussians
 
@@ -200,3 +204,97 @@ def test_bad_input_is_one_line_and_code_2(files, tmp_path, capsys, more, message
     assert message in error[0]
     assert not (out / "tracks.json").exists()
     assert not (out / "run.json").exists()
+
+
+# Every option reaches what does the work
+
+
+@pytest.fixture
+def stopped(files, tmp_path, monkeypatch, capsys):
+    """`stopped(*more)` runs the command up to the tracking; what that would have been told."""
+    monkeypatch.setenv("SGWARP_CACHE", str(tmp_path / "cache"))
+
+    def called(*more):
+        seen = []
+
+        def stop(sequence, views, tracker, questions, output, **keywords):
+            seen.append(SimpleNamespace(**{**locals(), **keywords}))
+            raise InputError("stopped here")
+
+        with monkeypatch.context() as patch:
+            patch.setattr(tracking_run, "run_tracking", stop)
+            parts = ["track", files / "params.npz", "--views", files, "--out", tmp_path / "out"]
+            assert main([str(part) for part in (*parts, "--encoder", f"files:{files / 'labels'}", *more)]) == 2
+        assert "stopped here" in capsys.readouterr().err
+        (call,) = seen
+        return call
+
+    return called
+
+
+OPTIONS = {
+    "forgetting": (0.25, lambda call: call.tracker.settings.fusion.forgetting),
+    "patience": (7, lambda call: call.tracker.settings.fusion.patience),
+    "change": (0.125, lambda call: call.tracker.settings.fusion.change),
+    "foreground": (True, lambda call: call.tracker.settings.foreground),
+    "incremental": (False, lambda call: call.tracker.settings.incremental),
+    "scoring": ("evidence", lambda call: call.questions.scoring),
+    "temperature": (0.5, lambda call: call.questions.temperature),
+    "unknown_below": (0.5, lambda call: call.questions.unknown_below),
+    "frames": (2, lambda call: call.frames),
+    "resume": (True, lambda call: call.resume),
+    "features": (True, lambda call: call.output.features),
+    "pictures": (False, lambda call: call.output.pictures),
+    "photographs": (False, lambda call: call.views.at(0)[0].view.image_path is not None),
+    "split": ("test", lambda call: "test" if [one.view.stem for one in call.views.at(0)] == ["3"] else "train"),
+    "associate": (True, lambda call: isinstance(call.tracker.source, Associated)),
+}
+
+
+@pytest.mark.parametrize("name", OPTIONS)
+def test_an_option_changes_what_it_names_alone(stopped, name):
+    value, read = OPTIONS[name]
+    option = f"--{name.replace('_', '-')}"
+    given = [option, value] if not isinstance(value, bool) else [option if value else f"--no-{option[2:]}"]
+    plain, changed = stopped(), stopped(*given)
+    assert read(plain) != value
+    assert read(changed) == value
+    others = set(OPTIONS) - {name}
+    assert all(OPTIONS[other][1](plain) == OPTIONS[other][1](changed) for other in others)
+
+
+def test_masks_and_questions_are_those_asked_for(stopped, files):
+    call = stopped()
+    assert (call.questions.classes, call.questions.texts, call.output.masks) == (None, (), None)
+    call = stopped("--classes", "3, 1", "--text", "open,closed", "--mask-views", files)
+    assert (call.questions.classes, call.questions.texts) == (("3", "1"), ("open", "closed"))
+    assert call.questions.encoder is None  # label images know ids only
+    assert [one.view.stem for one in call.output.masks.at(0)] == ["3"]
+    call = stopped("--mask-views", files, "--mask-split", "train")
+    assert [one.view.stem for one in call.output.masks.at(0)] == ["0", "1", "2"]
+
+
+def test_the_encoder_is_made_with_cache_and_device(stopped, monkeypatch, tmp_path):
+    asked = []
+
+    class Nothing:
+        space, needs_image = "toy", True
+
+        def encode(self, view, image):
+            raise AssertionError
+
+    def make(*arguments):
+        asked.append(arguments)
+        return Nothing()
+
+    monkeypatch.setattr("sgwarp.encoders.registry.make_encoder", make)
+    monkeypatch.setattr("sgwarp.encoders.registry.make_text_encoder", lambda name, device: (name, device))
+    assert stopped("--encoder", "conse").questions.encoder is None  # nothing is asked in words
+    name, views, device, folder, limit = asked.pop()
+    assert (name, [view.stem for view in views], device, limit) == ("conse", ["0", "1", "2"], "cpu", 10.0)
+    assert Path(folder) == tmp_path / "cache"
+    call = stopped("--encoder", "conse", "--text", "ball", "--cache", tmp_path / "mine", "--cache-limit", "0.5")
+    assert call.questions.encoder == ("conse", "cpu")
+    assert asked.pop()[3:] == (str(tmp_path / "mine"), 0.5)
+    stopped("--encoder", "conse", "--cache", "none")
+    assert asked.pop()[3] is None
