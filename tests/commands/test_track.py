@@ -1,17 +1,24 @@
 """`sgwarp track` on files in Dynamic3DGaussians' layout: what it writes, and that a killed run ends the same."""
 
 import json
+import shutil
+from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
+import torch
 
 from sgwarp.apps.tracking import run as tracking_run
+from sgwarp.apps.tracking.association import Associated
 from sgwarp.apps.tracking.state import read_features
 from sgwarp.cli import main
 from sgwarp.datasets.moving import LABELS, make_moving_scene
 from sgwarp.datasets.moving_files import save_moving_scene
+from sgwarp.errors import InputError
 from sgwarp.files.images import read_ids, read_rgb
 from sgwarp.io.scenes import save_gaussians
+from sgwarp.scene import FeatureMap
 
 FRAMES = 6
 
@@ -94,8 +101,6 @@ def test_pictures(files, tracked, tmp_path):
 
 def test_stored_features_are_those_of_the_frame(files, tracked):
     """What was left out differs by less than a hundredth of a row's length, and is less than everything."""
-    import torch
-
     from sgwarp.apps.tracking.sources import LabelFrames
     from sgwarp.apps.tracking.tracker import track
     from sgwarp.io.moving_views import load_moving_views
@@ -200,3 +205,187 @@ def test_bad_input_is_one_line_and_code_2(files, tmp_path, capsys, more, message
     assert message in error[0]
     assert not (out / "tracks.json").exists()
     assert not (out / "run.json").exists()
+
+
+# Every option reaches what does the work
+
+
+@pytest.fixture
+def stopped(files, tmp_path, monkeypatch, capsys):
+    """`stopped(*more)` runs the command up to the tracking; what that would have been told."""
+    monkeypatch.setenv("SGWARP_CACHE", str(tmp_path / "cache"))
+
+    def called(*more):
+        seen = []
+
+        def stop(sequence, views, tracker, questions, output, **keywords):
+            seen.append(SimpleNamespace(**{**locals(), **keywords}))
+            raise InputError("stopped here")
+
+        with monkeypatch.context() as patch:
+            patch.setattr(tracking_run, "run_tracking", stop)
+            parts = ["track", files / "params.npz", "--views", files, "--out", tmp_path / "out"]
+            assert main([str(part) for part in (*parts, "--encoder", f"files:{files / 'labels'}", *more)]) == 2
+        assert "stopped here" in capsys.readouterr().err
+        (call,) = seen
+        return call
+
+    return called
+
+
+OPTIONS = {
+    "forgetting": (0.25, lambda call: call.tracker.settings.fusion.forgetting),
+    "patience": (7, lambda call: call.tracker.settings.fusion.patience),
+    "change": (0.125, lambda call: call.tracker.settings.fusion.change),
+    "foreground": (True, lambda call: call.tracker.settings.foreground),
+    "incremental": (False, lambda call: call.tracker.settings.incremental),
+    "scoring": ("evidence", lambda call: call.questions.scoring),
+    "temperature": (0.5, lambda call: call.questions.temperature),
+    "unknown_below": (0.5, lambda call: call.questions.unknown_below),
+    "frames": (2, lambda call: call.frames),
+    "resume": (True, lambda call: call.resume),
+    "features": (True, lambda call: call.output.features),
+    "pictures": (False, lambda call: call.output.pictures),
+    "photographs": (False, lambda call: call.views.at(0)[0].view.image_path is not None),
+    "split": ("test", lambda call: "test" if [one.view.stem for one in call.views.at(0)] == ["3"] else "train"),
+    "associate": (True, lambda call: isinstance(call.tracker.source, Associated)),
+}
+
+
+@pytest.mark.parametrize("name", OPTIONS)
+def test_an_option_changes_what_it_names_alone(stopped, name):
+    value, read = OPTIONS[name]
+    option = f"--{name.replace('_', '-')}"
+    given = [option, value] if not isinstance(value, bool) else [option if value else f"--no-{option[2:]}"]
+    plain, changed = stopped(), stopped(*given)
+    assert read(plain) != value
+    assert read(changed) == value
+    others = set(OPTIONS) - {name}
+    assert all(OPTIONS[other][1](plain) == OPTIONS[other][1](changed) for other in others)
+
+
+def test_masks_and_questions_are_those_asked_for(stopped, files):
+    call = stopped()
+    assert (call.questions.classes, call.questions.texts, call.output.masks) == (None, (), None)
+    call = stopped("--classes", "3, 1", "--text", "open,closed", "--mask-views", files)
+    assert (call.questions.classes, call.questions.texts) == (("3", "1"), ("open", "closed"))
+    assert call.questions.encoder is None  # label images know ids only
+    assert [one.view.stem for one in call.output.masks.at(0)] == ["3"]
+    call = stopped("--mask-views", files, "--mask-split", "train")
+    assert [one.view.stem for one in call.output.masks.at(0)] == ["0", "1", "2"]
+
+
+def test_the_encoder_is_made_with_cache_and_device(stopped, monkeypatch, tmp_path):
+    asked = []
+
+    class Nothing:
+        space, needs_image = "toy", True
+
+        def encode(self, view, image):
+            raise AssertionError
+
+    def make(*arguments):
+        asked.append(arguments)
+        return Nothing()
+
+    monkeypatch.setattr("sgwarp.encoders.registry.make_encoder", make)
+    monkeypatch.setattr("sgwarp.encoders.registry.make_text_encoder", lambda name, device: (name, device))
+    assert stopped("--encoder", "conse").questions.encoder is None  # nothing is asked in words
+    name, views, device, folder, limit = asked.pop()
+    assert (name, [view.stem for view in views], device, limit) == ("conse", ["0", "1", "2"], "cpu", 10.0)
+    assert Path(folder) == tmp_path / "cache"
+    call = stopped("--encoder", "conse", "--text", "ball", "--cache", tmp_path / "mine", "--cache-limit", "0.5")
+    assert call.questions.encoder == ("conse", "cpu")
+    assert asked.pop()[3:] == (str(tmp_path / "mine"), 0.5)
+    stopped("--encoder", "conse", "--cache", "none")
+    assert asked.pop()[3] is None
+
+
+# Extremes, as files
+
+
+def changed_params(files, folder, change):
+    """A copy of the scene with other arrays, beside the same cameras and labels."""
+    with np.load(files / "params.npz") as archive:
+        arrays = {name: archive[name].copy() for name in archive}
+    change(arrays)
+    path = folder / "params.npz"
+    np.savez(path, **arrays)
+    return path
+
+
+def track_other(scene, files, out, *more):
+    parts = ["track", scene, "--views", files, "--encoder", f"files:{files / 'labels'}", "--out", out]
+    return main([*map(str, parts), "--no-pictures", *more])
+
+
+def test_nan_and_a_jump_in_one_frame_cost_that_frame_alone(files, tmp_path):
+    def spoil(arrays):
+        arrays["means3D"][2, 100:120] = np.nan
+        arrays["means3D"][2, 130] = 1e4
+
+    scene = changed_params(files, tmp_path, spoil)
+    alone, wrong = tmp_path / "alone", tmp_path / "wrong"
+    assert main(arguments(files, alone, "--forgetting", "0", "--frames", "4")) == 0
+    assert track_other(scene, files, wrong, "--forgetting", "0", "--frames", "4") == 0
+    for frame in (0, 1, 3):
+        for stem in ("0", "1", "2"):
+            name = f"{frame:05d}/{stem}.png"
+            assert (wrong / name).read_bytes() == (alone / name).read_bytes()
+    row = json.loads((wrong / "00002" / "frame.json").read_text())
+    extents = [one["extent"] for one in row["objects"] if one["extent"]]
+    assert np.abs(extents).max() < 10.0  # the one that jumped away is no part of an object's extent
+    assert track_other(scene, files, tmp_path / "fused", "--frames", "4") == 0
+
+
+def test_frames_without_gaussians_and_counts_that_change(files, tmp_path, capsys):
+    scene = make_moving_scene(0, FRAMES, 2500, cameras=4, width=64, height=48, moving_share=0.5)
+    folder = tmp_path / "ply"
+    folder.mkdir()
+    for index in (0, 2, 3):
+        one = scene.gaussians(index)
+        save_gaussians(one.subset(torch.arange(2400)) if index == 3 else one, folder / f"{index}.ply")
+    header = (folder / "0.ply").read_bytes().partition(b"end_header\n")[0] + b"end_header\n"
+    (folder / "1.ply").write_bytes(header.replace(b"element vertex 2500", b"element vertex 0"))
+    assert track_other(folder, files, tmp_path / "out", "--frames", "3") == 0  # an empty frame changes nothing
+    row = json.loads((tmp_path / "out" / "00001" / "frame.json").read_text())
+    assert not any(one["visible"] for one in row["objects"])
+    assert not read_ids(tmp_path / "out" / "00001" / "1.png").any()
+    assert read_ids(tmp_path / "out" / "00002" / "1.png").any()
+    capsys.readouterr()
+    assert track_other(folder, files, tmp_path / "none") == 2
+    error = capsys.readouterr().err.strip().splitlines()
+    assert len(error) == 1
+    assert "frame 3: has 2400 Gaussians, the frame before 2500, and no ids say" in error[0]
+    assert track_other(folder, files, tmp_path / "alone", "--forgetting", "0") == 0
+    capsys.readouterr()
+    assert main(["info", str(folder), "--json"]) == 0
+    assert json.loads(capsys.readouterr().out)["gaussians"] == "0 to 2500"
+
+
+def test_a_missing_photograph_costs_its_view_in_that_frame(files, tmp_path, monkeypatch):
+    """The others are still lifted, and the run says how many were left out."""
+
+    class Gray:
+        space, needs_image = "toy", True
+
+        def encode(self, view, image):
+            looked.append(view.stem)
+            return FeatureMap("toy", dense=torch.ones(*image.shape[:2], 2))
+
+        def encode_text(self, texts):
+            return torch.nn.functional.normalize(torch.ones(len(texts), 2), dim=1)
+
+    looked: list[str] = []
+    monkeypatch.setattr("sgwarp.encoders.registry.make_encoder", lambda *rest: Gray())
+    monkeypatch.setattr("sgwarp.encoders.registry.make_text_encoder", lambda *rest: Gray())
+    views = tmp_path / "views"
+    shutil.copytree(files / "ims", views / "ims")
+    shutil.copy(files / "train_meta.json", views)
+    next((views / "ims" / "1").glob("*000001.*")).unlink()
+    parts = ["track", files / "params.npz", "--views", views, "--encoder", "gray", "--classes", "a,b"]
+    parts += ["--out", tmp_path / "out", "--frames", "3", "--no-pictures"]
+    assert main([str(part) for part in parts]) == 0
+    assert looked == ["0", "1", "2", "0", "2", "0", "1", "2"]
+    run = json.loads((tmp_path / "out" / "run.json").read_text())
+    assert run["left_out"]["views_without_photograph"] == 1

@@ -99,8 +99,8 @@ def build_graph(
     row_of = np.full(count, -1)
     row_of[rows] = np.arange(len(rows))
     scale = 1.0 / np.sqrt(rates[rows])  # a Gaussian kept with probability p stands for 1 / p of its kind
-    parts: list[tuple[NDArray[Any], ...]] = []
-    totals: list[tuple[NDArray[Any], ...]] = []
+    parts: list[Any] = []  # sparse matrices: as lists of pairs they would take three times the memory
+    totals: list[Any] = []
     view_of: list[int] = []
     for number, view in enumerate(views):
         weight_of = view.totals(count)[rows]
@@ -110,24 +110,17 @@ def build_graph(
         owner, kept = row_of[owner], row_of[owner] >= 0
         owner = owner[kept]
         claim = weight[kept] / weight_of[owner] * total[owner]
-        parts.append((owner, mask[kept] + len(view_of), claim * scale[owner]))
-        seen = np.flatnonzero(total)
-        totals.append((seen, np.full(len(seen), number), total[seen] * scale[seen]))
+        parts.append(sparse.csc_matrix((claim * scale[owner], (owner, mask[kept])), shape=(len(rows), len(masks))))
+        totals.append(sparse.csc_matrix((total * scale)[:, None]))
         view_of += [number] * len(masks)
-    claims = _matrix(parts, (len(rows), len(view_of)))
-    visible = (claims.T @ _matrix(totals, (len(rows), len(views)))).toarray()
+    claims = sparse.hstack(parts, format="csc")
+    parts.clear()
+    visible = (claims.T @ sparse.hstack(totals, format="csc")).toarray()
     first, second, shared = _overlaps(claims, np.array(view_of, np.int64), visible)
     means = None
     if features is not None:
         means = np.asarray(claims.T @ sparse.diags(scale) @ features[rows].astype(np.float64))
     return MaskGraph(first, second, shared, visible, np.array(view_of, np.int64), means)
-
-
-def _matrix(parts: Sequence[tuple[NDArray[Any], ...]], shape: tuple[int, int]) -> Any:
-    from scipy import sparse
-
-    row, column, value = (np.concatenate(part) for part in zip(*parts, strict=True))
-    return sparse.csr_matrix((value, (row, column)), shape=shape)
 
 
 def _overlaps(
@@ -137,6 +130,7 @@ def _overlaps(
     own = visible[np.arange(len(view_of)), view_of]
     found: list[tuple[NDArray[Any], ...]] = []
     by_mask = claims.T.tocsr()
+    claims = claims.tocsr()
     for start in range(0, len(view_of), BLOCK):
         block = (by_mask[start : start + BLOCK] @ claims).tocoo()
         first, second, value = block.row.astype(np.int64) + start, block.col.astype(np.int64), block.data

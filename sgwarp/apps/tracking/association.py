@@ -42,6 +42,7 @@ class Associated:
         self._apart: set[tuple[int, int]] = set()  # pairs of objects that are two masks of one image
         self._ready: dict[str, Tensor] = {}  # objects in the images of this frame, int64 [h, w]
         self.count = 0  # objects so far, those that became one with another included
+        self.joined: list[tuple[int, int]] = []  # in this frame: objects that stay, and those that became one with them
 
     def observe(self, frame: int, gaussians: Gaussians, views: list[FrameView]) -> None:
         """Match all images of the next frame.
@@ -55,7 +56,7 @@ class Associated:
                 f"masks without ids: the number of Gaussians changed from {len(before)} to {len(gaussians)}; only "
                 "Gaussians that stay can remember objects"
             )
-        self._ready = {}
+        self._ready, self.joined = {}, []
         if not len(gaussians):
             return
         self._gaussians = gaussians
@@ -149,6 +150,7 @@ class Associated:
         flat[:, kept] += flat[:, gone]
         flat[:, gone] = 0.0
         table[table == gone] = kept
+        self.joined.append((kept, gone))
         rename = {gone: kept}
         pairs = ((rename.get(one, one), rename.get(other, other)) for one, other in self._apart)
         self._apart = {(min(pair), max(pair)) for pair in pairs if pair[0] != pair[1]}

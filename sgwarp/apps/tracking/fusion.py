@@ -108,6 +108,13 @@ class Fusion:
         past.weight_squared.mul_(decay.square()).addcmul_(sums.weight_squared, gain)
         return past
 
+    def join(self, kept: int, gone: int) -> None:
+        """Give what is known of one label to another: they turned out to be the same object."""
+        if self.evidence is not None and gone < self.evidence.features.shape[1]:
+            features = self.evidence.features
+            features[:, kept] += features[:, gone]
+            features[:, gone] = 0.0
+
     def _carried(self, count: int, ids: Tensor | None, frame: int) -> Evidence:
         """The past, in the order of this frame's rows."""
         past = self.evidence

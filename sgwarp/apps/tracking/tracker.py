@@ -109,6 +109,9 @@ class Tracker:
         observe = getattr(self.source, "observe", None)
         if observe is not None:
             observe(frame.index, gaussians, views)
+        if self.fusion is not None:
+            for kept, gone in getattr(self.source, "joined", ()):
+                self.fusion.join(kept, gone)
         for view in views:
             self._add(frame.index, view, gaussians)
         with self.log.stage("lift"):

@@ -1,0 +1,195 @@
+"""Edits by language in the demo room: how much of the object they reach, and what else they change; seconds at 1M.
+
+    python -m benchmarks.editing [quality] [time] [rotation] [--out benchmarks/editing.json] [--pictures DIR]
+
+Three edits, seen in the held-out views that show the object: remove the lamp, move the teddy bear, make the couch
+green. Each is done with four selections: the Gaussians whose lifted true label is the object's, and the text with
+semantics of the default encoder alone, with instances of the true masks, and with instances of OpenCV's proposals.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import time
+from dataclasses import dataclass
+from pathlib import Path
+
+import torch
+from torch import Tensor
+
+import sgwarp as sg
+from sgwarp.apps.editing import operations as ops
+from sgwarp.apps.editing.measurement import measure_edit
+from sgwarp.apps.editing.picker import EditContext, EditState, pick
+from sgwarp.demo.data import Room
+from sgwarp.files.images import write_rgb
+from sgwarp.ops.splatting.settings import RasterSettings
+from sgwarp.querying.scores import class_votes
+from sgwarp.scene import Camera, Gaussians
+
+RESULTS = Path(__file__).with_name("editing.json")
+LEAST_PIXELS = 50  # of an object in a view that counts
+COUNT = 1_000_000
+
+
+@dataclass(frozen=True)
+class Task:
+    """An edit: what the text says, the class that is meant, and what is done to it."""
+
+    name: str
+    text: str
+    label: str
+    operation: ops.Operation
+
+
+TASKS = (
+    Task("remove the lamp", "lamp", "lamp", ops.Remove()),
+    Task("move the teddy bear", "teddy bear", "teddy bear", ops.Move((0.0, -0.3, 0.0))),
+    Task("make the couch green", "couch", "couch", ops.Recolor(ops.COLORS["green"])),
+)
+
+
+def true_selection(room: Room, number: int) -> Tensor:
+    """Gaussians whose lifted true label is this class, bool [N]."""
+    semantics = sg.lift(room.gaussians, room.views, room.label_map)
+    best, channel = class_votes(semantics, room.names).max(dim=1)
+    return (best > 0) & (channel == number)
+
+
+def seen_at(scene: Gaussians, chosen: Tensor, camera: Camera) -> Tensor:
+    """Pixels that show the chosen Gaussians more than anything else, bool [H, W]."""
+    return sg.render(scene, camera, "features", features=chosen.float()[:, None])[..., 0] > 0.5
+
+
+def quality(pictures: Path | None) -> dict:
+    """Completeness and leakage in every held-out view that shows the object."""
+    room = Room.load()
+    scene, views = room.gaussians, room.views
+    encoder = sg.make_encoder("conse", views)
+    semantics = sg.lift(scene, views, encoder)
+    contexts = {"semantics alone": EditContext(semantics, encoder)}
+    for name, source in {"true masks": f"files:{room.folder / 'labels'}", "proposals": "graph"}.items():
+        contexts[f"instances of {name}"] = EditContext(semantics, encoder, sg.instances(scene, views, source))
+    rows: dict[str, dict] = {}
+    for task in TASKS:
+        number = room.names.index(task.label)
+        truth = true_selection(room, number)
+        chosen = {"true selection": truth} | {name: by_text(scene, task.text, one) for name, one in contexts.items()}
+        rows[task.name] = {}
+        for name, selection in chosen.items():
+            row: dict = {"Gaussians": int(selection.sum()), "right": int((selection & truth).sum())}
+            if row["Gaussians"]:
+                row |= measured(room, task, truth, selection, pictures and pictures / f"{task.name} {name}")
+            rows[task.name][name] = row
+            print(task.name, name, row, flush=True)
+    return rows
+
+
+def measured(room: Room, task: Task, truth: Tensor, chosen: Tensor, pictures: Path | None) -> dict:
+    """Figures of one edit by view; pixels where a moved object comes to lie count as its own."""
+    scene, number = room.gaussians, room.names.index(task.label)
+    edited = task.operation.apply(scene, chosen).gaussians
+    rows = {}
+    for view in room.held_out:
+        mask = room.truth[view.stem] == number
+        if int(mask.sum()) < LEAST_PIXELS:
+            continue
+        if isinstance(task.operation, ops.Move):
+            mask = mask | seen_at(task.operation.apply(scene, truth).gaussians, truth, view.camera)
+        before, after = (sg.render(one, view.camera).clamp(0, 1) for one in (scene, edited))
+        found = measure_edit(before, after, mask)
+        rows[view.stem] = {"completeness": found.completeness, "leakage": found.leakage}
+        if pictures is not None:
+            write_rgb(pictures.with_name(f"{pictures.name} {view.stem}.png"), torch.cat([before, after], dim=1))
+    return rows
+
+
+def by_text(scene: Gaussians, text: str, context: EditContext) -> Tensor:
+    """What a text selects; nothing where it names nothing."""
+    try:
+        return sg.EditSession(scene, context).preview(sg.Selection((text,)))
+    except sg.InputError:
+        return torch.zeros(len(scene), dtype=torch.bool)
+
+
+def cloud(count: int, degree: int = 3) -> Gaussians:
+    random = torch.Generator().manual_seed(0)
+    means = torch.rand(count, 3, generator=random) * torch.tensor([6.0, 3.0, 5.0])
+    quats = torch.nn.functional.normalize(torch.randn(count, 4, generator=random), dim=1)
+    scales = 0.002 + 0.02 * torch.rand(count, 3, generator=random)
+    sh = 0.3 * torch.randn(count, (degree + 1) ** 2, 3, generator=random)
+    return Gaussians(means, quats, scales, 0.1 + 0.9 * torch.rand(count, generator=random), sh)
+
+
+def seconds(pictures: Path | None) -> dict:
+    """Seconds of selecting a tenth of 1,000,000 Gaussians of degree 3, and of each operation on it."""
+    scene = cloud(COUNT)
+    nothing = torch.zeros(COUNT, dtype=torch.int32)
+    state = EditState(scene, torch.arange(COUNT), nothing, nothing.bool())
+    rows: dict[str, float] = {}
+    selections = {
+        "box": sg.Selection(("box:0,0,0,0.6,3,5",), clean=False),
+        "box, cleaned": sg.Selection(("box:0,0,0,0.6,3,5",)),
+        "box, cleaned, grown": sg.Selection(("box:0,0,0,0.6,3,5",), grow=0.05),
+        "box, cleaned, shrunk": sg.Selection(("box:0,0,0,0.6,3,5",), grow=-0.05),
+    }
+    chosen = torch.zeros(COUNT, dtype=torch.bool)
+    for name, selection in selections.items():
+        start = time.perf_counter()
+        found = pick(state, selection, EditContext())
+        rows[f"select {name}"] = time.perf_counter() - start
+        chosen = found if name == "box, cleaned" else chosen
+    operations = (ops.Remove(), ops.Isolate(0.1), ops.Move((0.1, 0, 0)), ops.Rotate((0, 0, 1), 30.0), ops.Scale(1.5))
+    for operation in (*operations, ops.Recolor((0.1, 0.6, 0.15)), ops.Duplicate((1.0, 0, 0))):
+        start = time.perf_counter()
+        operation.apply(scene, chosen)
+        rows[operation.name] = time.perf_counter() - start
+    start = time.perf_counter()
+    ops.Rotate((0, 0, 1), 30.0).apply(scene, torch.ones(COUNT, dtype=torch.bool))
+    rows["rotate all"] = time.perf_counter() - start
+    print(json.dumps(rows, indent=1))
+    return {"Gaussians": COUNT, "selected": int(chosen.sum()), "threads": torch.get_num_threads(), "seconds": rows}
+
+
+def rotation(pictures: Path | None) -> dict:
+    """Largest difference of a picture from that of the turned scene and camera, in the demo room."""
+    room = Room.load()
+    scene = room.gaussians
+    quat = torch.nn.functional.normalize(torch.tensor([0.7, -0.3, 0.5, 0.4], dtype=torch.float64), dim=0)
+    center = scene.means[scene.finite].double().mean(dim=0)
+    turned = ops.rotate_gaussians(scene, torch.ones(len(scene), dtype=torch.bool), quat, center)
+    R = ops.rotation_matrix(quat)
+    back = torch.eye(4, dtype=torch.float64)  # x' = R (x - c) + c
+    back[:3, :3], back[:3, 3] = R.T, center - R.T @ center
+    rows = {}
+    exact = RasterSettings(alpha_min=2.0**-16, transmittance_min=0.0)
+    for name, settings in (("default cut-offs", RasterSettings()), ("without cut-offs", exact)):
+        for view in room.held_out:
+            camera = view.camera
+            other = Camera(camera.K, camera.world_to_camera @ back, camera.width, camera.height)
+            pair = [sg.render(one, eye, settings=settings) for one, eye in ((scene, camera), (turned, other))]
+            error = (pair[0] - pair[1]).abs()
+            row = {"largest": float(error.max()), "over 1e-5": float((error > 1e-5).float().mean())}
+            rows[f"{name}, view {view.stem}"] = row
+    print(json.dumps(rows, indent=1))
+    return rows
+
+
+PARTS = {"quality": quality, "time": seconds, "rotation": rotation}
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("parts", nargs="*", default=list(PARTS), help=", ".join(PARTS))
+    parser.add_argument("--out", type=Path, default=RESULTS)
+    parser.add_argument("--pictures", type=Path, help="folder for before and after of each edit")
+    options = parser.parse_args()
+    results = json.loads(options.out.read_text()) if options.out.is_file() else {}
+    for name in options.parts:
+        results[name] = PARTS[name](options.pictures)
+        options.out.write_text(json.dumps(results, indent=1) + "\n")
+
+
+if __name__ == "__main__":
+    main()
