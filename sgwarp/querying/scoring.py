@@ -10,6 +10,7 @@ import torch
 from torch import Tensor
 
 from sgwarp.encoders.base import TextEncoder
+from sgwarp.encoders.calibration import calibration_of
 from sgwarp.encoders.prompts import CANONICAL
 from sgwarp.errors import InputError
 from sgwarp.ops.splatting.settings import RasterSettings
@@ -32,12 +33,14 @@ class TextScores:
             lifted label images.
         level: Evidence that a text has to exceed to be worth more than "none of these".
         seen: Gaussians that have a score, bool [N].
+        known: Texts that mean something to the encoder, bool [Q]; the evidence of the others is 0.
     """
 
     values: Tensor
     evidence: Tensor | None
     level: float
     seen: Tensor
+    known: Tensor
 
 
 def score_texts(
@@ -45,7 +48,7 @@ def score_texts(
     texts: Sequence[str],
     encoder: TextEncoder | None = None,
     *,
-    measure: Measure = "cosine",
+    measure: Measure | None = None,
     canonical: Sequence[str] = CANONICAL,
     predicted: Semantics | None = None,
     ensemble: Ensemble = "max",
@@ -56,7 +59,8 @@ def score_texts(
         semantics: N Gaussians.
         texts: Q phrases; for lifted label images, their labels.
         encoder: Text encoder of the semantics' space; not needed for lifted label images.
-        measure: "cosine", or "relevancy": how much better a text fits than any canonical phrase.
+        measure: "cosine", or "relevancy": how much better a text fits than any canonical phrase; None for what the
+            encoder is calibrated for.
         canonical: Phrases that a text has to beat with "relevancy".
         predicted: Semantics that the network predicts for the same Gaussians.
         ensemble: How the scores of the two become one, see `combine`.
@@ -65,22 +69,34 @@ def score_texts(
         InputError: No text or an empty one, a label that was not lifted, an unknown measure, a missing encoder or one
             of another space, or semantics that do not belong together.
     """
-    if measure not in get_args(Measure):
+    if measure is not None and measure not in get_args(Measure):
         raise InputError(f"measure: expected one of {', '.join(get_args(Measure))}, got '{measure}'")
     seen = seen_by(semantics, predicted, ensemble)
     if semantics.labels is not None:
         shares = class_votes(semantics, texts, predicted=predicted, ensemble=ensemble)
-        return TextScores(shares, None, 0.0, seen)
+        return TextScores(shares, None, 0.0, seen, torch.ones(len(texts), dtype=torch.bool))
     if encoder is None:
         raise InputError(f"encoder: texts need the text encoder of space '{semantics.space}'")
+    calibration = calibration_of(encoder)
+    if measure is None:
+        measure = "relevancy" if calibration.scoring == "relevancy" else "cosine"
 
     def score(one: Semantics) -> Tensor:
         if measure == "cosine":
-            return evidence(query(one, texts, encoder), one)
+            return evidence(query(one, texts, encoder), one, calibration.least_deviation)
         return evidence(relevancy(one, texts, encoder, canonical), one)
 
     scores = score_together(score, semantics, predicted, ensemble)
-    return TextScores(rescale(scores, seen), scores, none_level(predicted, ensemble), seen)
+    known = calibration.known(texts)
+    standing_out = torch.where(known.to(scores.device), scores, 0.0)
+    level = none_level(predicted, ensemble, calibration)
+    return TextScores(rescale(scores, seen), standing_out, level, seen, known)
+
+
+def without_counterpart(texts: Sequence[str], encoder: TextEncoder) -> list[str]:
+    """Texts that mean nothing to an encoder: what they name stays unknown."""
+    known = calibration_of(encoder).known(texts)
+    return [text for text, means in zip(texts, known.tolist(), strict=True) if not means]
 
 
 def best_texts(
