@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from importlib import import_module
@@ -31,6 +32,7 @@ class Calibration:
         level: Evidence that a class has to exceed.
         least_deviation: Smallest deviation of a text's cosines over the scene that counts as such: a text that varies
             less is not made as loud as one that the scene shows.
+        certain: Cosine that reaches `level` by itself: what fills the scene does not stand out from its mean.
         counterparts: "module:function" that tells which texts mean something to the encoder, bool [Q] from Q texts; ""
             if all of them do. The others get no Gaussian, and what they would name is unknown.
     """
@@ -39,6 +41,7 @@ class Calibration:
     temperature: float
     level: float = 1.0
     least_deviation: float = 0.0
+    certain: float = math.inf
     counterparts: str = ""
 
     def known(self, texts: Sequence[str]) -> Tensor:

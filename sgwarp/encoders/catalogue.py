@@ -68,7 +68,11 @@ SAM_OPTIONS = {
 
 # Chosen on one room, see docs/lift-and-ask.md. ImageNet's classes do not include walls or floors, hence `counterparts`.
 CONSE = Calibration(
-    "evidence", 0.3, least_deviation=0.02, counterparts="sgwarp.encoders.images.conse.text:have_counterparts"
+    "evidence",
+    0.3,
+    least_deviation=0.02,
+    certain=0.5,
+    counterparts="sgwarp.encoders.images.conse.text:have_counterparts",
 )
 CLIP = Calibration("relevancy", 0.1)  # scale and phrases of LERF (2023), for features lifted from CLIP
 LSEG = Calibration("cosine", 0.07)  # trained with this temperature over a list that names everything

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 
 import torch
@@ -75,6 +76,19 @@ def evidence(scores: Tensor, semantics: Semantics, least_deviation: float = 0.0)
     if not bool(seen.any()):
         return torch.zeros_like(scores)
     return standardise(scores, seen, least_deviation) * (weight / (weight + weight[seen].median()))[:, None]
+
+
+@isolated
+def standing_out(cosines: Tensor, semantics: Semantics, calibration: Calibration) -> Tensor:
+    """`evidence` of cosines [N, Q] as an encoder is calibrated; where a cosine is certain, at least its share of the
+    level, weighted by nothing: what fills the scene does not stand out from its mean."""
+    relative = evidence(cosines, semantics, calibration.least_deviation)
+    return torch.maximum(relative, certainty(cosines, calibration)) if calibration.certain < math.inf else relative
+
+
+def certainty(cosines: Tensor, calibration: Calibration) -> Tensor:
+    """Evidence that a cosine is by itself: the level where it is `calibration.certain`; [..., Q]."""
+    return calibration.level * cosines / calibration.certain
 
 
 def rescale(scores: Tensor, seen: Tensor) -> Tensor:
@@ -153,7 +167,7 @@ def class_votes(
 
     def score(one: Semantics) -> Tensor:
         cosines = query(one, [*classes, *rivals], encoder)
-        return evidence(cosines, one, calibration.least_deviation) if calibration.scoring == "evidence" else cosines
+        return standing_out(cosines, one, calibration) if calibration.scoring == "evidence" else cosines
 
     scores = score_together(score, semantics, predicted, ensemble)
     wanted = scores[:, : len(classes)]

@@ -15,7 +15,7 @@ from sgwarp.encoders.prompts import CANONICAL
 from sgwarp.errors import InputError
 from sgwarp.ops.splatting.settings import RasterSettings
 from sgwarp.querying.ensembles import Ensemble, score_together, seen_by
-from sgwarp.querying.scores import class_votes, evidence, none_level, query, relevancy, rescale
+from sgwarp.querying.scores import class_votes, evidence, none_level, query, relevancy, rescale, standing_out
 from sgwarp.querying.segmentation import segment_votes, splat_scores
 from sgwarp.scene import Camera, Gaussians, Semantics
 
@@ -29,8 +29,8 @@ class TextScores:
     Attributes:
         values: 0 at the scene's median and 1 at its best thousandth, so that one threshold serves all texts and views;
             for lifted label images the shares of the labels. float32 [N, Q].
-        evidence: The same before `rescale`, 0 at the scene's mean and 1 at its deviation, float32 [N, Q]; None for
-            lifted label images.
+        evidence: The same before `rescale`, 0 at the scene's mean and 1 at its deviation, as the encoder is calibrated
+            (see `standing_out`), float32 [N, Q]; None for lifted label images.
         level: Evidence that a text has to exceed to be worth more than "none of these".
         seen: Gaussians that have a score, bool [N].
         known: Texts that mean something to the encoder, bool [Q]; the evidence of the others is 0.
@@ -83,14 +83,17 @@ def score_texts(
 
     def score(one: Semantics) -> Tensor:
         if measure == "cosine":
-            return evidence(query(one, texts, encoder), one, calibration.least_deviation)
-        return evidence(relevancy(one, texts, encoder, canonical), one)
+            cosines = query(one, texts, encoder)
+            return torch.cat([evidence(cosines, one), standing_out(cosines, one, calibration)], dim=1)
+        scores = evidence(relevancy(one, texts, encoder, canonical), one)
+        return torch.cat([scores, scores], dim=1)
 
-    scores = score_together(score, semantics, predicted, ensemble)
+    both = score_together(score, semantics, predicted, ensemble)
+    scores, proof = both[:, : len(texts)], both[:, len(texts) :]
     known = calibration.known(texts)
-    standing_out = torch.where(known.to(scores.device), scores, 0.0)
+    proof = torch.where(known.to(proof.device), proof, 0.0)
     level = none_level(predicted, ensemble, calibration)
-    return TextScores(rescale(scores, seen), standing_out, level, seen, known)
+    return TextScores(rescale(scores, seen), proof, level, seen, known)
 
 
 def without_counterpart(texts: Sequence[str], encoder: TextEncoder) -> list[str]:

@@ -84,13 +84,14 @@ def test_relevancy_votes_against_the_strongest_negative(semantics):
     np.testing.assert_allclose(votes, expected, atol=1e-6)
 
 
-@pytest.mark.parametrize("least", [0.0, 0.5])
-def test_evidence_votes_with_a_least_deviation(semantics, least):
-    encoder = Axes(Calibration("evidence", 0.4, level=0.7, least_deviation=least))
+@pytest.mark.parametrize(("least", "certain"), [(0.0, np.inf), (0.5, np.inf), (0.1, 0.6)])
+def test_evidence_votes(semantics, least, certain):
+    encoder = Axes(Calibration("evidence", 0.4, level=0.7, least_deviation=least, certain=certain))
     votes = class_votes(semantics, list("ab"), encoder)
     c, seen, w = cosines(semantics)[:, :2], semantics.seen.numpy(), semantics.weight.double().numpy()
     trust = w / (w + np.sort(w[seen])[(seen.sum() - 1) // 2])
     score = (c - c[seen].mean(axis=0)) / np.maximum(c[seen].std(axis=0), least) * trust[:, None]
+    score = np.maximum(score, 0.7 * c / certain) if certain < np.inf else score
     rivals = np.concatenate([score, np.full((len(score), 1), 0.7)], axis=1)
     np.testing.assert_allclose(votes, softmax(rivals / 0.4)[:, :2] * seen[:, None], atol=1e-5)
 
@@ -102,6 +103,14 @@ def test_a_text_that_no_part_of_the_scene_shows_stays_below_the_level(semantics)
     quiet = class_votes(faint, ["a"], Axes(Calibration("evidence", 0.3, least_deviation=0.02)))
     assert loud.max() > 0.9
     assert quiet.max() < 0.1
+
+
+def test_what_fills_the_scene_is_found_although_it_does_not_stand_out(semantics):
+    full = replace(semantics, features=semantics.features * 0.01 + torch.eye(len(NAMES))[0] * semantics.seen[:, None])
+    relative = class_votes(full, ["a"], Axes(Calibration("evidence", 0.3, least_deviation=0.02)))
+    certain = class_votes(full, ["a"], Axes(Calibration("evidence", 0.3, least_deviation=0.02, certain=0.5)))
+    assert relative.max() < 0.5
+    assert (certain[full.seen] > 0.5).all()
 
 
 def test_texts_without_counterpart_get_nothing(semantics, only_a_and_b):

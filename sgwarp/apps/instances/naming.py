@@ -11,7 +11,7 @@ from sgwarp.encoders.base import TextEncoder
 from sgwarp.encoders.calibration import calibration_of
 from sgwarp.encoders.prompts import CANONICAL
 from sgwarp.errors import InputError
-from sgwarp.querying.scores import class_shares, standardise
+from sgwarp.querying.scores import certainty, class_shares, standardise
 from sgwarp.scene import InstanceMap
 
 
@@ -43,7 +43,8 @@ def name_instances(found: InstanceMap, classes: Sequence[str], encoder: TextEnco
     scores = torch.nn.functional.normalize(found.features, dim=1) @ texts.T
     scores, none = scores[:, : len(classes)], scores[:, len(classes) :].amax(dim=1, keepdim=True) if rivals else None
     if calibration.scoring == "evidence":
-        scores = standardise(scores, known, calibration.least_deviation)
+        certain = certainty(scores, calibration)
+        scores = torch.maximum(standardise(scores, known, calibration.least_deviation), certain)
         none = torch.full_like(scores[:, :1], calibration.level)
     shares = class_shares(scores, none, calibration, calibration.known(classes))
     score, place = shares.max(dim=1)
