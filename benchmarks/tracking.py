@@ -120,8 +120,8 @@ def centroids(one: object, scene: MovingScene) -> tuple[torch.Tensor, torch.Tens
 
 def encoder(frames: int = 60) -> dict:
     """The same with the default encoder, which knows ImageNet's words; body parts count as the person."""
+    from sgwarp.encoders.calibration import Scoring
     from sgwarp.encoders.registry import make_encoder
-    from sgwarp.querying.scores import Scoring
 
     scene = make_moving_scene(0, frames, 12_000, moving_share=0.4, width=320, height=240)
     table = torch.tensor([0, 1, 2, 3, 4, *[5] * 6, 6, 7, 7])

@@ -36,8 +36,9 @@ FRAGMENT = TILE * PADDED_ROW
 
 
 @cache
-def make_lift_dense_block(ordered: bool) -> wp.Kernel:
-    """Kernel that lifts a dense map: atomic additions, or one row for each place if `ordered`."""
+def make_lift_dense_block(ordered: bool, squared: bool = False) -> wp.Kernel:
+    """Kernel that lifts a dense map: atomic additions, or one row for each place if `ordered`; with weight alpha T, or
+    its square."""
 
     @wp.kernel(module="unique", module_options=BLOCK_OPTIONS, enable_backward=False)
     def lift_dense_block(
@@ -96,7 +97,10 @@ def make_lift_dense_block(ordered: bool) -> wp.Kernel:
             staged = wp.tile_load_indexed(splats, indices=ranks, shape=(BATCH,), storage="shared")
             for b in range(size):
                 alpha = alpha_at(wp.tile_extract(staged, b), x, y, knobs)
-                put(shares, WEIGHTS * b + t, contribution(alpha, T, knobs) * seen)
+                weight = contribution(alpha, T, knobs)
+                if wp.static(squared):
+                    weight *= weight
+                put(shares, WEIGHTS * b + t, weight * seen)
                 T = attenuated(alpha, T, knobs)
             if T > 0.0:
                 put(still_open, turn, 1.0)
@@ -162,8 +166,9 @@ def make_lift_dense_block(ordered: bool) -> wp.Kernel:
 
 
 @cache
-def make_lift_ids_block(ordered: bool) -> wp.Kernel:
-    """Kernel that lifts an id map: atomic additions per (Gaussian, id), or weights for each place if `ordered`."""
+def make_lift_ids_block(ordered: bool, squared: bool = False) -> wp.Kernel:
+    """Kernel that lifts an id map: atomic additions per (Gaussian, id), or weights for each place if `ordered`; with
+    weight alpha T, or its square."""
 
     @wp.kernel(module="unique", module_options=BLOCK_OPTIONS, enable_backward=False)
     def lift_ids_block(
@@ -212,7 +217,10 @@ def make_lift_ids_block(ordered: bool) -> wp.Kernel:
             staged = wp.tile_load_indexed(splats, indices=ranks, shape=(BATCH,), storage="shared")
             for b in range(size):
                 alpha = alpha_at(wp.tile_extract(staged, b), x, y, knobs)
-                put(shares, FRAGMENT * b + mine, contribution(alpha, T, knobs))
+                weight = contribution(alpha, T, knobs)
+                if wp.static(squared):
+                    weight *= weight
+                put(shares, FRAGMENT * b + mine, weight)
                 T = attenuated(alpha, T, knobs)
             if T > 0.0:
                 put(still_open, turn, 1.0)

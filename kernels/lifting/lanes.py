@@ -13,7 +13,7 @@ import warp as wp
 from sgwarp.kernels.binning import AHEAD, TILE, prefetch
 from sgwarp.kernels.compositing.lanes import CLOSE_EVERY, open_tile, still_open
 from sgwarp.kernels.gaussian import Splat
-from sgwarp.kernels.lifting.loops import fragment_lift, lift_fragment_ids
+from sgwarp.kernels.lifting.loops import fragment_lift, fragment_lift_ids
 from sgwarp.kernels.projection.forward import Knobs
 from sgwarp.kernels.transmittance import LANE_OPTIONS, LaneIds, Lanes
 
@@ -21,9 +21,9 @@ wp.set_module_options(LANE_OPTIONS)
 
 
 @cache
-def make_lift_dense(slices: int) -> wp.Kernel:
-    """Kernel that lifts `16 slices` channels of a dense map (1 or 4 slices)."""
-    lift_fragment = fragment_lift(slices)
+def make_lift_dense(slices: int, squared: bool = False) -> wp.Kernel:
+    """Kernel that lifts `16 slices` channels of a dense map (1 or 4 slices), with weight alpha T or its square."""
+    lift_fragment = fragment_lift(slices, squared)
 
     @wp.kernel(module="unique", module_options=LANE_OPTIONS, enable_backward=False)
     def lift_dense(
@@ -78,62 +78,72 @@ def make_lift_dense(slices: int) -> wp.Kernel:
     return lift_dense
 
 
-@wp.kernel
-def lift_ids(
-    # In:
-    base: int,
-    slot: int,
-    chosen: wp.array[int],  # tiles to lift, or empty: all
-    offsets: wp.array[int],  # [tiles + 1]
-    listed: wp.array[int],  # [I]
-    splats: wp.array[Splat],  # [V]
-    local_ids: wp.array2d[LaneIds],  # [tiles, 16] place of each pixel's id in its tile's list, -1 = none
-    uniform: wp.array2d[int],  # [tiles, 16] the local id if the whole row shares it, else -2
-    row_starts: wp.array[int],  # [tiles + 1] first weight of each tile
-    knobs: Knobs,
-    width: int,
-    height: int,
-    state: wp.array3d[Lanes],  # [slots, 16, 1] scratch
-    # Out:
-    weights_out: wp.array[float],  # zeroed; for each place one weight per id of its tile
-    starts_out: wp.array[int],  # [I] first weight of each place
-):
-    """Sum of alpha T by id: the cost does not depend on the number of feature channels."""
-    tile = base + wp.tid()
-    if chosen.shape[0] > 0:
-        tile = chosen[tile]
-    columns = (width + TILE - 1) / TILE
-    x0 = (tile % columns) * TILE
-    y0 = (tile / columns) * TILE
-    open_rows = open_tile(slot, x0, y0, width, height, 1, 1, state)
-    first = offsets[tile]
-    stop = offsets[tile + 1]
-    count = wp.max(stop - first, 1)
-    ids = (row_starts[tile + 1] - row_starts[tile]) / count
-    plain = ids == 1
-    for row in range(TILE):
-        if uniform[tile, row] != 0:
-            plain = False
-    for k in range(first, stop):
-        prefetch(splats, listed[wp.min(k + AHEAD, stop - 1)])
-        place = row_starts[tile] + (k - first) * ids
-        starts_out[k] = place
-        lift_fragment_ids(
-            slot,
-            listed[k],
-            place,
-            tile,
-            x0,
-            y0,
-            open_rows,
-            ids,
-            plain,
-            splats,
-            local_ids,
-            uniform,
-            knobs,
-            state,
-            weights_out,
-        )
-        if (k - first) % CLOSE_EVERY == CLOSE_EVERY - 1:
-            open_rows = still_open(open_rows, state, slot)
+@cache
+def make_lift_ids(squared: bool) -> wp.Kernel:
+    """Kernel that adds alpha T, or its square, up by id."""
+    lift_fragment_ids = fragment_lift_ids(squared)
+
+    @wp.kernel(module="unique", module_options=LANE_OPTIONS, enable_backward=False)
+    def lift_ids(
+        # In:
+        base: int,
+        slot: int,
+        chosen: wp.array[int],  # tiles to lift, or empty: all
+        offsets: wp.array[int],  # [tiles + 1]
+        listed: wp.array[int],  # [I]
+        splats: wp.array[Splat],  # [V]
+        local_ids: wp.array2d[LaneIds],  # [tiles, 16] place of each pixel's id in its tile's list, -1 = none
+        uniform: wp.array2d[int],  # [tiles, 16] the local id if the whole row shares it, else -2
+        row_starts: wp.array[int],  # [tiles + 1] first weight of each tile
+        knobs: Knobs,
+        width: int,
+        height: int,
+        state: wp.array3d[Lanes],  # [slots, 16, 1] scratch
+        # Out:
+        weights_out: wp.array[float],  # zeroed; for each place one weight per id of its tile
+        starts_out: wp.array[int],  # [I] first weight of each place
+    ):
+        """Sum of alpha T by id: the cost does not depend on the number of feature channels."""
+        tile = base + wp.tid()
+        if chosen.shape[0] > 0:
+            tile = chosen[tile]
+        columns = (width + TILE - 1) / TILE
+        x0 = (tile % columns) * TILE
+        y0 = (tile / columns) * TILE
+        open_rows = open_tile(slot, x0, y0, width, height, 1, 1, state)
+        first = offsets[tile]
+        stop = offsets[tile + 1]
+        count = wp.max(stop - first, 1)
+        ids = (row_starts[tile + 1] - row_starts[tile]) / count
+        plain = ids == 1
+        for row in range(TILE):
+            if uniform[tile, row] != 0:
+                plain = False
+        for k in range(first, stop):
+            prefetch(splats, listed[wp.min(k + AHEAD, stop - 1)])
+            place = row_starts[tile] + (k - first) * ids
+            starts_out[k] = place
+            lift_fragment_ids(
+                slot,
+                listed[k],
+                place,
+                tile,
+                x0,
+                y0,
+                open_rows,
+                ids,
+                plain,
+                splats,
+                local_ids,
+                uniform,
+                knobs,
+                state,
+                weights_out,
+            )
+            if (k - first) % CLOSE_EVERY == CLOSE_EVERY - 1:
+                open_rows = still_open(open_rows, state, slot)
+
+    return lift_ids
+
+
+lift_ids = make_lift_ids(False)

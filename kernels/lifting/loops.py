@@ -9,7 +9,8 @@ from sgwarp.kernels.native import snippet
 from sgwarp.kernels.projection.forward import Knobs
 from sgwarp.kernels.transmittance import LaneIds, Lanes
 
-# The rows that a splat reaches, from the first to the last; `weight_of` gives alpha T and steps the row behind it.
+# The rows that a splat reaches, from the first to the last; `weight_of` gives alpha T, or its square, and steps the row
+# behind it.
 WALK = """
     const auto& s = splats.data[rank];
     Row middles, tops;
@@ -18,7 +19,8 @@ WALK = """
     *reinterpret_cast<Row*>(middle_of) = middles, *reinterpret_cast<Row*>(top_of) = tops;
     const auto weight_of = [&](int row) -> Row {
         Row& T = *reinterpret_cast<Row*>(state.data + slot * 16 + row);
-        return take(opacity(offsets * s.a + middle_of[row], top_of[row], knobs), knobs, T);
+        const Row w = take(opacity(offsets * s.a + middle_of[row], top_of[row], knobs), knobs, T);
+        return SQUARED ? w * w : w;
     };
 """
 
@@ -90,10 +92,11 @@ FEW_IDS = 8  # up to here a masked sum per id beats adding pixel by pixel
 
 
 @cache
-def fragment_lift(slices: int) -> wp.Function:
-    """Device function that lifts `16 slices` channels of a dense map (1 or 4 slices) onto one fragment of a tile."""
+def fragment_lift(slices: int, squared: bool = False) -> wp.Function:
+    """Device function that lifts `16 slices` channels of a dense map (1 or 4 slices) onto one fragment of a tile, with
+    weight alpha T or its square."""
 
-    @wp.func_native(snippet(DENSE, SLICES=slices))
+    @wp.func_native(snippet(DENSE, SLICES=slices, SQUARED=squared))
     def lift_fragment(
         slot: int,
         rank: int,  # of the splat
@@ -115,21 +118,27 @@ def fragment_lift(slices: int) -> wp.Function:
     return lift_fragment
 
 
-@wp.func_native(snippet(IDS, FEW_IDS=FEW_IDS))
-def lift_fragment_ids(
-    slot: int,
-    rank: int,
-    first: int,  # weight of the fragment that belongs to its tile's first id
-    tile: int,
-    x0: int,
-    y0: int,
-    open_rows: int,
-    ids: int,  # of the tile
-    plain: bool,  # all its pixels have the same one
-    splats: wp.array[Splat],
-    local_ids: wp.array2d[LaneIds],  # [tiles, 16]
-    uniform: wp.array2d[int],  # [tiles, 16]
-    knobs: Knobs,
-    state: wp.array3d[Lanes],
-    weights_out: wp.array[float],  # zeroed
-): ...
+@cache
+def fragment_lift_ids(squared: bool) -> wp.Function:
+    """Device function that adds one fragment's weights alpha T, or their squares, up by id."""
+
+    @wp.func_native(snippet(IDS, FEW_IDS=FEW_IDS, SQUARED=squared))
+    def lift_fragment_ids(
+        slot: int,
+        rank: int,
+        first: int,  # weight of the fragment that belongs to its tile's first id
+        tile: int,
+        x0: int,
+        y0: int,
+        open_rows: int,
+        ids: int,  # of the tile
+        plain: bool,  # all its pixels have the same one
+        splats: wp.array[Splat],
+        local_ids: wp.array2d[LaneIds],  # [tiles, 16]
+        uniform: wp.array2d[int],  # [tiles, 16]
+        knobs: Knobs,
+        state: wp.array3d[Lanes],
+        weights_out: wp.array[float],  # zeroed
+    ): ...
+
+    return lift_fragment_ids

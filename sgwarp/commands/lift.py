@@ -38,14 +38,31 @@ class Lift(SceneOptions):
     cache_limit: float = 10.0
     """Size of that folder, at most [gigabytes]: the maps not used for longest go first."""
 
-    mode: Literal["weighted", "center"] = "weighted"
-    """weighted: all pixels a Gaussian contributes to; center: the pixel of its centre, with a depth test."""
+    mode: Literal["weighted", "center", "squared", "strongest", "robust", "solve"] = "weighted"
+    """weighted: all pixels a Gaussian contributes to; center: the pixel of its center, with a depth test; squared: as
+    weighted, with squared weights; strongest: only pixels where it contributes most; robust: the median of the views;
+    solve: what renders best to the maps."""
 
     tau: float = 0.05
     """Relative depth tolerance of mode center."""
 
     border: int = 10
     """Pixels along the image edge that mode center ignores."""
+
+    passes: int = 4
+    """Times that mode robust walks over the views after the first."""
+
+    ridge: float = 0.0
+    """How strongly mode solve keeps to the weighted mean; 0 chooses it by views that are held out."""
+
+    iterations: int = 8
+    """Steps of mode solve."""
+
+    reliability: bool = False
+    """Count a view less, the less the others agree with it."""
+
+    fill: int = 0
+    """Give Gaussians that no view saw the mean of so many seen neighbors; 0 leaves them empty."""
 
     share_of_views: float = 1.0
     """Use only this share of the views, evenly spread."""
@@ -87,7 +104,10 @@ class Lift(SceneOptions):
         from sgwarp.encoders.cache import CachedMaps, default_folder
         from sgwarp.encoders.registry import make_encoder
         from sgwarp.lifting.lifter import lift
+        from sgwarp.lifting.settings import LiftSettings
 
+        names = ("tau", "border", "passes", "ridge", "iterations", "reliability", "fill")
+        options = LiftSettings(**{name: getattr(self, name) for name in names})
         folder = None if self.cache == "none" else self.cache or default_folder()
         with log.stage("load_encoder"):
             source = make_encoder(self.encoder, views, self.device, folder, self.cache_limit)
@@ -97,8 +117,7 @@ class Lift(SceneOptions):
                 views,
                 source,
                 self.mode,
-                tau=self.tau,
-                border=self.border,
+                lift_settings=options,
                 share_of_views=self.share_of_views,
                 deterministic=self.deterministic or None,
                 progress=progress,

@@ -98,6 +98,9 @@ class SemanticsOptions(SceneOptions):
     templates: tuple[str, ...] = ()
     """What phrases are put into, such as "a photo of a {}", or plain, photo, room; the encoder's own if not given."""
 
+    min_weight: float = 0.0
+    """Gaussians with a smaller weight have no say, as if no view had seen them: 1 is one pixel filled by it alone."""
+
     predicted: Path | None = None
     """What `sgwarp predict` wrote for this scene; it is then asked together with the lifted semantics."""
 
@@ -125,7 +128,10 @@ class SemanticsOptions(SceneOptions):
         """
         gaussians = self.load_scene(log)
         with log.stage("read"):
-            return gaussians, load_on(self.semantics, gaussians)
+            semantics = load_on(self.semantics, gaussians).without_faint(self.min_weight)
+        if not bool(semantics.seen.any()):
+            raise InputError(f"--min-weight {self.min_weight:g}: no Gaussian has as much; choose less")
+        return gaussians, semantics
 
     def load_predicted(self, gaussians: Gaussians, log: RunLog) -> Semantics | None:
         """The predicted semantics on the chosen device, None if they were not given or are not asked.

@@ -36,8 +36,9 @@ class Query(SemanticsOptions):
     out: Path
     """Mask to write, .png, 255 on what was found and 0 elsewhere; the heat map {out}_heat.png goes beside it."""
 
-    score: Literal["cosine", "relevancy"] = "cosine"
-    """relevancy: how much better the text fits than any of --canonical."""
+    score: Literal["cosine", "relevancy"] | None = None
+    """If not given, what the encoder is calibrated for. relevancy: how much better the text fits than any of
+    --canonical."""
 
     canonical: tuple[str, ...] = ("object", "things", "stuff", "texture")
     """What the text has to beat with --score relevancy."""

@@ -13,6 +13,8 @@ from sgwarp.runs.progress import show_progress
 if TYPE_CHECKING:
     from torch import Tensor
 
+    from sgwarp.encoders.base import TextEncoder
+    from sgwarp.runs.log import RunLog
     from sgwarp.scene import Semantics, View
 
 
@@ -37,11 +39,12 @@ class Segment(SemanticsOptions):
     view: str | None = None
     """Only the view of this name."""
 
-    scoring: Literal["evidence", "cosine"] = "cosine"
-    """"cosine" gives every pixel one of the classes, so name all; "evidence" leaves what fits none of them unknown."""
+    scoring: Literal["evidence", "cosine", "relevancy"] | None = None
+    """How a class is chosen; if not given, what the encoder is calibrated for. "cosine" gives every pixel one of the
+    classes, so name all; "evidence" and "relevancy" leave what fits none of them unknown."""
 
     temperature: float | None = None
-    """Of the softmax over the classes, per Gaussian; 0.3 for evidence and 0.1 for cosine if not given."""
+    """Of the softmax over the classes, per Gaussian; the encoder's own if not given."""
 
     unknown_below: float = 0.0
     """Pixels whose best class has a smaller confidence are unknown, 0 to 1."""
@@ -67,6 +70,7 @@ class Segment(SemanticsOptions):
             if classes is not None and semantics.labels is None:
                 with log.stage("load_encoder"):
                     encoder = self.text_encoder(semantics)
+                self._warn(classes, encoder, log)
             with log.stage("query"):
                 scoring = (self.temperature, self.scoring)
                 votes = class_votes(semantics, classes, encoder, *scoring, predicted=predicted, ensemble=self.ensemble)
@@ -85,6 +89,15 @@ class Segment(SemanticsOptions):
                     unknown += float((channel < 0).float().mean())
                     progress(done, len(views), view.stem)
             log.error["unknown"] = unknown / len(views)
+
+    def _warn(self, classes: list[str], encoder: TextEncoder, log: RunLog) -> None:
+        """Say which classes the encoder cannot tell, unless another scoring is asked for, which asks it anyway."""
+        from sgwarp.querying.scoring import without_counterpart
+
+        foreign = without_counterpart(classes, encoder) if self.scoring in (None, "evidence") else []
+        if foreign:
+            print(f"the encoder knows nothing like {', '.join(foreign)}: what they name stays unknown")
+            log.leave_out("classes_without_counterpart", len(foreign))
 
     def _write(
         self, view: View, image: Tensor, channel: Tensor, classes: list[str] | None, lifted: Semantics | None

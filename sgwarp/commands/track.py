@@ -70,7 +70,7 @@ class Track(Options):
     frames: int | None = None
     """Only so many frames, from the first."""
 
-    scoring: Literal["evidence", "cosine"] = "cosine"
+    scoring: Literal["evidence", "cosine", "relevancy"] | None = None
     """As for `sgwarp segment`."""
 
     temperature: float | None = None

@@ -6,6 +6,8 @@ from dataclasses import dataclass, field
 from importlib.util import find_spec
 from typing import Literal
 
+from sgwarp.encoders.calibration import Calibration
+
 Role = Literal["pixels", "images", "instances", "masks", "maps"]
 
 EXTRAS: dict[str, tuple[str, ...]] = {  # packages that tell whether an extra is installed
@@ -31,6 +33,7 @@ class Kind:
         extra: What has to be installed.
         make: Its builder as "module:function", in the folder of its role; see `building`.
         speak: The builder of its text side, "" if it has none.
+        calibration: The scoring that its space is calibrated for; None for sources that have no space of their own.
         options: Name and type of what may follow the question mark.
     """
 
@@ -43,6 +46,7 @@ class Kind:
     options: dict[str, str] = field(default_factory=dict)
     make: str = field(kw_only=True)
     speak: str = field(default="", kw_only=True)
+    calibration: Calibration | None = field(default=None, kw_only=True)
 
     @property
     def missing(self) -> list[str]:
@@ -62,6 +66,17 @@ SAM_OPTIONS = {
     **RULE,
 }
 
+# Chosen on one room, see docs/lift-and-ask.md. ImageNet's classes do not include walls or floors, hence `counterparts`.
+CONSE = Calibration(
+    "evidence",
+    0.3,
+    least_deviation=0.02,
+    certain=0.5,
+    counterparts="sgwarp.encoders.images.conse.text:have_counterparts",
+)
+CLIP = Calibration("relevancy", 0.1)  # scale and phrases of LERF (2023), for features lifted from CLIP
+LSEG = Calibration("cosine", 0.07)  # trained with this temperature over a list that names everything
+
 KINDS = (
     Kind(
         "conse",
@@ -73,6 +88,7 @@ KINDS = (
         {**TEMPLATES},
         make="sgwarp.encoders.images.conse.encoder:make_source",
         speak="sgwarp.encoders.images.conse.text:make_text",
+        calibration=CONSE,
     ),
     Kind(
         "clip",
@@ -84,6 +100,7 @@ KINDS = (
         {**TEMPLATES, **SEEN, "rule": "text"},
         make="sgwarp.encoders.images.clip:make_source",
         speak="sgwarp.encoders.images.clip:make_text",
+        calibration=CLIP,
     ),
     Kind(
         "siglip",
@@ -95,6 +112,7 @@ KINDS = (
         {**TEMPLATES, **SEEN, "rule": "text"},
         make="sgwarp.encoders.images.clip:make_source",
         speak="sgwarp.encoders.images.clip:make_text",
+        calibration=CLIP,
     ),
     Kind(
         "siglip2",
@@ -106,6 +124,7 @@ KINDS = (
         {**TEMPLATES, **SEEN, "rule": "text"},
         make="sgwarp.encoders.images.clip:make_source",
         speak="sgwarp.encoders.images.clip:make_text",
+        calibration=CLIP,
     ),
     Kind(
         "lseg",
@@ -117,6 +136,7 @@ KINDS = (
         {**TEMPLATES, **SEEN, "tokenizer": "text"},
         make="sgwarp.encoders.pixels.lseg:make_source",
         speak="sgwarp.encoders.pixels.lseg:make_text",
+        calibration=LSEG,
     ),
     Kind(
         "openseg",

@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
-from typing import Literal
 
 import torch
 from torch import Tensor
 
 from sgwarp.encoders.base import TextEncoder
+from sgwarp.encoders.calibration import PLAIN, Calibration, Scoring, calibration_of
 from sgwarp.encoders.prompts import CANONICAL
 from sgwarp.errors import InputError
 from sgwarp.querying.ensembles import Ensemble, score_together, seen_by
@@ -50,20 +51,21 @@ def relevancy(
     return torch.where(semantics.seen.to(better.device)[:, None], better, 0.0)
 
 
-def standardise(scores: Tensor, seen: Tensor) -> Tensor:
+def standardise(scores: Tensor, seen: Tensor, least_deviation: float = 0.0) -> Tensor:
     """Scores [N, Q] with mean 0 and deviation 1 per query over the seen Gaussians, so that no query is louder than
-    another; 0 where nothing was seen."""
+    another; 0 where nothing was seen. A query whose scores deviate less than `least_deviation` is divided by that."""
     seen = seen.to(scores.device)
     known = scores[seen].double()
     if not len(known):
         return torch.zeros_like(scores)
     deviation, mean = torch.std_mean(known, dim=0, correction=0)
+    deviation = deviation.clamp(min=least_deviation)
     scaled = (scores - mean) / torch.where(deviation > 0, deviation, 1.0)
     return torch.where(seen[:, None], scaled, 0.0).to(scores.dtype)
 
 
 @isolated
-def evidence(scores: Tensor, semantics: Semantics) -> Tensor:
+def evidence(scores: Tensor, semantics: Semantics, least_deviation: float = 0.0) -> Tensor:
     """Scores [N, Q] standardized over the scene and weighted by how well each Gaussian was seen.
 
     `standardise`, times w / (w + median w) with w the weight behind a Gaussian's feature: one that a single grazing
@@ -73,7 +75,20 @@ def evidence(scores: Tensor, semantics: Semantics) -> Tensor:
     seen = semantics.seen.to(scores.device)
     if not bool(seen.any()):
         return torch.zeros_like(scores)
-    return standardise(scores, seen) * (weight / (weight + weight[seen].median()))[:, None]
+    return standardise(scores, seen, least_deviation) * (weight / (weight + weight[seen].median()))[:, None]
+
+
+@isolated
+def standing_out(cosines: Tensor, semantics: Semantics, calibration: Calibration) -> Tensor:
+    """`evidence` of cosines [N, Q] as an encoder is calibrated; where a cosine is certain, at least its share of the
+    level, weighted by nothing: what fills the scene does not stand out from its mean."""
+    relative = evidence(cosines, semantics, calibration.least_deviation)
+    return torch.maximum(relative, certainty(cosines, calibration)) if calibration.certain < math.inf else relative
+
+
+def certainty(cosines: Tensor, calibration: Calibration) -> Tensor:
+    """Evidence that a cosine is by itself: the level where it is `calibration.certain`; [..., Q]."""
+    return calibration.level * cosines / calibration.certain
 
 
 def rescale(scores: Tensor, seen: Tensor) -> Tensor:
@@ -102,21 +117,17 @@ def confidence(scores: Tensor, temperature: float) -> Tensor:
     return torch.softmax(scores / temperature, dim=-1)
 
 
-Scoring = Literal["evidence", "cosine"]
-TEMPERATURES: dict[Scoring, float] = {"evidence": 0.3, "cosine": 0.1}
-NONE_LEVEL = 1.0  # evidence of "none of these": a class must stand out further from the scene's mean
-
-
 @isolated
 def class_votes(
     semantics: Semantics,
     classes: Sequence[str] | None,
     encoder: TextEncoder | None = None,
     temperature: float | None = None,
-    scoring: Scoring = "cosine",
+    scoring: Scoring | None = None,
     *,
     predicted: Semantics | None = None,
     ensemble: Ensemble = "max",
+    canonical: Sequence[str] = CANONICAL,
 ) -> Tensor:
     """Per-Gaussian class scores, float32 [N, Q]; 0 where nothing was seen.
 
@@ -124,17 +135,19 @@ def class_votes(
 
     - "evidence": softmax over the classes' `evidence` and a level for none of them. No class wins everywhere by being
       loud, and what fits none of the names goes to none; for a list of what to look for.
+    - "relevancy": softmax over the cosines of the classes and of the canonical phrase that fits best, which is none.
     - "cosine": softmax over the cosines (paper, Sec. III-D); for a list that names everything in the scene.
 
     Args:
         semantics: N Gaussians.
         classes: Q names.
         encoder: Text encoder of the semantics' space.
-        temperature: Of the softmax; None for 0.3 (evidence) or 0.1 (cosine).
-        scoring: See above.
+        temperature: Of the softmax; None for what the encoder states.
+        scoring: See above; None for what the encoder states, see `sgwarp.encoders.calibration`.
         predicted: Semantics that the network predicts for the same Gaussians; the scores of the two become one before
             the softmax (paper, Sec. III-D), shares before they are made to add up to 1 again.
         ensemble: How, see `combine`.
+        canonical: Phrases that a class has to beat with "relevancy".
 
     Raises:
         InputError: No classes, or an encoder missing, where one is needed; a class that is not among the lifted labels;
@@ -147,24 +160,55 @@ def class_votes(
         raise InputError(f"classes: semantics in space '{semantics.space}' need the names of the classes to look for")
     if encoder is None:
         raise InputError(f"encoder: classes need the text encoder of space '{semantics.space}'")
-    if scoring not in TEMPERATURES:
-        raise InputError(f"scoring: expected one of {', '.join(TEMPERATURES)}, got '{scoring}'")
+    if scoring is not None and scoring not in PLAIN:
+        raise InputError(f"scoring: expected one of {', '.join(PLAIN)}, got '{scoring}'")
+    calibration = calibration_of(encoder, scoring)
+    rivals = tuple(canonical) if calibration.scoring == "relevancy" else ()
 
     def score(one: Semantics) -> Tensor:
-        cosines = query(one, classes, encoder)
-        return evidence(cosines, one) if scoring == "evidence" else cosines
+        cosines = query(one, [*classes, *rivals], encoder)
+        return standing_out(cosines, one, calibration) if calibration.scoring == "evidence" else cosines
 
     scores = score_together(score, semantics, predicted, ensemble)
-    if scoring == "evidence":
-        none = torch.full_like(scores[:, :1], none_level(predicted, ensemble))
-        scores = torch.cat([scores, none], dim=1)
-    votes = confidence(scores, TEMPERATURES[scoring] if temperature is None else temperature)[:, : len(classes)]
+    wanted = scores[:, : len(classes)]
+    none = None
+    if calibration.scoring == "evidence":
+        none = torch.full_like(wanted[:, :1], none_level(predicted, ensemble, calibration))
+    elif rivals:
+        none = scores[:, len(classes) :].amax(dim=1, keepdim=True)
+    votes = class_shares(wanted, none, calibration, calibration.known(classes), temperature)
     return torch.where(seen.to(votes.device)[:, None], votes, 0.0)
 
 
-def none_level(predicted: Semantics | None, ensemble: Ensemble) -> float:
+def class_shares(
+    scores: Tensor, none: Tensor | None, calibration: Calibration, known: Tensor, temperature: float | None = None
+) -> Tensor:
+    """Shares of the classes, which add up to 1 together with that of "none of these", float32 [N, Q].
+
+    Args:
+        scores: Of the classes, [N, Q].
+        none: Score of "none of these", [N, 1]; None without it.
+        calibration: Temperature of the softmax.
+        known: Classes that mean something to the encoder, bool [Q]; the others get nothing.
+        temperature: In place of the calibration's.
+
+    Raises:
+        InputError: The temperature is not positive and finite.
+    """
+    known = known.to(scores.device)
+    if not bool(known.any()):
+        return torch.zeros_like(scores)
+    rivals = scores if none is None else torch.cat([scores, none], dim=1)
+    quiet = torch.nn.functional.pad(~known, (0, rivals.shape[1] - len(known)))
+    shares = confidence(
+        rivals.masked_fill(quiet, -torch.inf), calibration.temperature if temperature is None else temperature
+    )
+    return shares[:, : scores.shape[1]]
+
+
+def none_level(predicted: Semantics | None, ensemble: Ensemble, calibration: Calibration) -> float:
     """Evidence of "none of these": a sum of two scores has to exceed twice the level."""
-    return NONE_LEVEL * (2 if predicted is not None and ensemble == "sum" else 1)
+    return calibration.level * (2 if predicted is not None and ensemble == "sum" else 1)
 
 
 def _label_votes(

@@ -12,11 +12,12 @@ import torch
 from torch import Tensor
 
 from sgwarp.encoders.base import TextEncoder
+from sgwarp.encoders.calibration import Scoring
 from sgwarp.errors import InputError
 from sgwarp.ops.splatting.forward import rasterize
 from sgwarp.ops.splatting.settings import RasterSettings
 from sgwarp.querying.ensembles import Ensemble, seen_by
-from sgwarp.querying.scores import Scoring, class_votes
+from sgwarp.querying.scores import class_votes
 from sgwarp.runs.isolation import isolated
 from sgwarp.scene import Camera, Gaussians, Semantics
 
@@ -66,7 +67,7 @@ def segment(
     encoder: TextEncoder | None = None,
     *,
     temperature: float | None = None,
-    scoring: Scoring = "cosine",
+    scoring: Scoring | None = None,
     unknown_below: float = 0.0,
     predicted: Semantics | None = None,
     ensemble: Ensemble = "max",
@@ -81,7 +82,8 @@ def segment(
         camera: The view.
         encoder: Text encoder of the semantics' space; not needed for lifted label or id images.
         temperature: Of the softmax over the classes, per Gaussian, before they are splatted; see `class_votes`.
-        scoring: "evidence" leaves unknown what fits no class, "cosine" gives every pixel a class; see `class_votes`.
+        scoring: "evidence" and "relevancy" leave unknown what fits no class, "cosine" gives every pixel a class; None
+            for what the encoder is calibrated for; see `class_votes`.
         unknown_below: Pixels whose best class has a smaller confidence are unknown, in [0, 1].
         predicted: Semantics that the network predicts for the scene, to be asked together with the lifted ones.
         ensemble: How the two become one, see `combine`; one of them alone answers where only it knows a Gaussian.

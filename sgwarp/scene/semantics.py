@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+import math
+from dataclasses import dataclass, replace
 
+import torch
 from torch import Tensor
 
 from sgwarp.errors import InputError
@@ -57,6 +59,17 @@ class Semantics:
     def coverage(self) -> float:
         """Share of the Gaussians that at least one view saw."""
         return float(self.seen.float().mean()) if len(self) else 0.0
+
+    def without_faint(self, min_weight: float) -> Semantics:
+        """The same with Gaussians of a smaller weight taken for unseen.
+
+        Raises:
+            InputError: `min_weight` is negative or not finite.
+        """
+        require(0 <= min_weight < math.inf, f"min_weight: expected a finite number from 0 on, got {min_weight}")
+        if min_weight == 0:
+            return self
+        return replace(self, weight=torch.where(self.weight >= min_weight, self.weight, 0.0))
 
     def require_scene(self, gaussians: Gaussians) -> None:
         """Raise InputError if these features belong to another scene."""

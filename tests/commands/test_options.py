@@ -19,6 +19,7 @@ from sgwarp.files.images import read_ids, read_rgb, write_ids
 from sgwarp.io.points import load_points
 from sgwarp.io.store import load_semantics, read_notes, save_semantics
 from sgwarp.lifting.lifter import lift
+from sgwarp.lifting.settings import LiftSettings
 from sgwarp.ops.launcher import get_threads, set_threads
 from sgwarp.querying.scoring import score_texts
 from sgwarp.querying.segmentation import localize, segment
@@ -203,11 +204,18 @@ def test_lift_arguments(stopped, stage_files, tmp_path):
     assert gaussians.fingerprint == stage_files.gaussians.fingerprint
     assert [view.stem for view in views] == [f"{k:04d}" for k in range(6)]
     assert all(view.image_path is not None for view in views)
-    assert (mode, call.tau, call.border, call.share_of_views, call.deterministic) == ("weighted", 0.05, 10, 1.0, None)
+    assert (mode, call.lift_settings, call.share_of_views, call.deterministic) == (
+        "weighted",
+        LiftSettings(),
+        1.0,
+        None,
+    )
     more = ["--mode", "center", "--tau", 0.2, "--border", 3, "--share-of-views", 0.5, "--deterministic"]
+    more += ["--passes", 7, "--ridge", 2.5, "--iterations", 9, "--reliability", "--fill", 2]
     call = stopped(LIFT, *arguments, *more, "--no-photographs")
     assert call.positional[3] == "center"
-    assert (call.tau, call.border, call.share_of_views, call.deterministic) == (0.2, 3, 0.5, True)
+    chosen = LiftSettings(tau=0.2, border=3, passes=7, ridge=2.5, iterations=9, reliability=True, fill=2)
+    assert (call.lift_settings, call.share_of_views, call.deterministic) == (chosen, 0.5, True)
     assert all(view.image_path is None for view in call.positional[1])
 
 
@@ -237,12 +245,27 @@ def test_lift_notes_how_it_was_done(stage, stage_files, tmp_path):
 # query and segment
 
 
+def test_faint_gaussians_have_no_say(stopped, stage_files, semantics, speaks, tmp_path, capsys):
+    """--min-weight takes the weight from those below it, in every command that asks semantics."""
+    weight = load_semantics(semantics.text).weight
+    least = float(weight[weight > 0].median())
+    more = ["--semantics", semantics.text, "--views", stage_files.views, "--min-weight", least]
+    target = "sgwarp.querying.scores.class_votes"
+    call = stopped(target, "segment", stage_files.scene, *more, "--classes", "lamp", "--out", tmp_path / "maps")
+    asked = call.positional[0]
+    assert torch.equal(asked.weight, torch.where(weight >= least, weight, 0.0))
+    assert 0.4 < asked.seen.float().mean() < 0.6
+    more[-1] = 1e9
+    assert run("segment", stage_files.scene, *more, "--classes", "lamp", "--out", tmp_path / "maps") == 2
+    assert "--min-weight 1e+09: no Gaussian has as much" in capsys.readouterr().err
+
+
 def test_query_scores_what_it_is_told(stopped, stage_files, semantics, speaks, tmp_path):
     target = "sgwarp.querying.scoring.score_texts"
     arguments = ["query", stage_files.scene, "--views", stage_files.views, "--view", "0002", "--text", "lamp"]
     arguments += ["--out", tmp_path / "mask.png", "--semantics"]
     call = stopped(target, *arguments, semantics.text)
-    assert (call.positional[1], call.measure, call.ensemble, call.predicted) == (["lamp"], "cosine", "max", None)
+    assert (call.positional[1], call.measure, call.ensemble, call.predicted) == (["lamp"], None, "max", None)
     assert call.canonical == ("object", "things", "stuff", "texture")
     assert speaks.pop() == ("toy", "clip:somewhere", "cpu", None)
     more = ["--score", "relevancy", "--canonical", "x", "y", "--predicted", semantics.predicted, "--ensemble", "sum"]
@@ -283,7 +306,7 @@ def test_segment_votes_as_it_is_told(stopped, stage_files, semantics, speaks, tm
     arguments += ["--semantics", semantics.text, "--classes", "lamp,wall"]
     call = stopped(target, *arguments)
     assert call.positional[1] == ["lamp", "wall"]
-    assert call.positional[3:] == (None, "cosine")
+    assert call.positional[3:] == (None, None)
     assert (call.predicted, call.ensemble) == (None, "max")
     more = ["--scoring", "evidence", "--temperature", 0.7, "--predicted", semantics.predicted, "--ensemble", "mean"]
     call = stopped(target, *arguments, *more)

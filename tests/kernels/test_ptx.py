@@ -41,8 +41,8 @@ def cuda_kernels() -> list[wp.Kernel]:
     for flag in (False, True):
         kernels += [compositing_block.make_composite_colors_block(depth, flag) for depth in (False, True)]
         kernels.append(compositing_block.make_composite_features_block(flag))
-        kernels.append(lifting_block.make_lift_dense_block(flag))
-        kernels.append(lifting_block.make_lift_ids_block(flag))
+        kernels += [lifting_block.make_lift_dense_block(flag, squared) for squared in (False, True)]
+        kernels += [lifting_block.make_lift_ids_block(flag, squared) for squared in (False, True)]
         kernels.append(pixel_lists.make_list_contributors(flag))
         kernels.append(voxels.make_list_pairs(flag))
     for wide, ordered in itertools.product((False, True), repeat=2):

@@ -309,7 +309,7 @@ def test_not_a_number_is_refused_unless_marked_invalid(stage):
 @pytest.mark.parametrize(
     ("change", "message"),
     [
-        ({"mode": "squared"}, "mode: 'squared'"),
+        ({"mode": "cubed"}, "mode: 'cubed'"),
         ({"tau": 0.0}, "tau must be positive"),
         ({"tau": math.nan}, "tau must be positive"),
         ({"border": -1}, "border not negative"),

@@ -14,7 +14,8 @@ from sgwarp.apps.editing.selection import Selection, Term, parse_term
 from sgwarp.encoders.base import TextEncoder
 from sgwarp.errors import InputError
 from sgwarp.ops.splatting.contributors import top_contributors
-from sgwarp.querying.scores import class_votes, evidence, query, rescale
+from sgwarp.querying.scores import class_votes
+from sgwarp.querying.scoring import score_texts
 from sgwarp.scene import Gaussians, InstanceMap, Semantics, View
 
 NEIGHBORS = 8  # of a Gaussian when pieces are told apart
@@ -132,12 +133,15 @@ def score_text(text: str, selection: Selection, context: EditContext) -> Tensor:
         return class_votes(semantics, [text])[:, 0] > selection.threshold
     if context.encoder is None:
         raise InputError(f"select '{text}': needs the text encoder of space '{semantics.space}'")
-    phrases = [text, *selection.negatives]
-    scores = evidence(query(semantics, phrases, context.encoder), semantics)
+    answers = score_texts(semantics, [text, *selection.negatives], context.encoder)
+    if not bool(answers.known[0]):
+        raise InputError(f"select '{text}': the encoder knows nothing like it; choose another word")
+    scores = answers.evidence
+    assert scores is not None
     rivals = scores[:, 1:].max(dim=1).values if selection.negatives else torch.full_like(scores[:, 0], -torch.inf)
     if context.instances is not None:
         return _name_instances(scores[:, 0], rivals, semantics.seen, context.instances)
-    return (rescale(scores[:, :1], semantics.seen)[:, 0] > selection.threshold) & (scores[:, 0] > rivals)
+    return (answers.values[:, 0] > selection.threshold) & (scores[:, 0] > rivals)
 
 
 def _named(text: str, instances: InstanceMap | None) -> Tensor | None:

@@ -12,8 +12,9 @@ from torch import Tensor
 
 from sgwarp.apps.tracking.tracker import TrackedFrame
 from sgwarp.encoders.base import TextEncoder
+from sgwarp.encoders.calibration import Scoring
 from sgwarp.errors import InputError
-from sgwarp.querying.scores import Scoring, class_votes, query
+from sgwarp.querying.scores import class_votes, query
 from sgwarp.querying.segmentation import UNKNOWN, segment_votes
 from sgwarp.scene import Gaussians, View
 
@@ -36,7 +37,7 @@ class Questions:
     classes: tuple[str, ...] | None = None
     texts: tuple[str, ...] = ()
     encoder: TextEncoder | None = None
-    scoring: Scoring = "cosine"
+    scoring: Scoring | None = None
     temperature: float | None = None
     unknown_below: float = 0.0
 

@@ -69,9 +69,15 @@ def _every_tile(device: torch.device) -> wp.array:
 
 
 def weigh_ids(
-    lists: tiles.TileLists, camera: Camera, local: LocalIds, settings: RasterSettings, *, block: bool
+    lists: tiles.TileLists,
+    camera: Camera,
+    local: LocalIds,
+    settings: RasterSettings,
+    *,
+    block: bool,
+    squared: bool = False,
 ) -> list[wp.array]:
-    """Sum of alpha T of every splat for every id of its tile, in a fixed order.
+    """Sum of alpha T, or of its square, of every splat for every id of its tile, in a fixed order.
 
     Returns what kernels read that gather them by Gaussian: entries, places, starts, tiles, ids of the tiles, their
     counts, weights.
@@ -82,7 +88,7 @@ def weigh_ids(
     outputs = [view(weights, wp.float32), view(starts, wp.int32)]
     if block:
         unused = [view(torch.empty(size, device=device), wp.float32) for size in ((0, 0), (0,))]
-        kernel = lifting_block.make_lift_ids_block(True)
+        kernel = lifting_block.make_lift_ids_block(True, squared)
         inputs = [*lists.arrays(), *local.block_arrays(), tiles.knobs(settings), width, height]
         launch_blocks(kernel, [lists.tile_count], inputs, [*unused, *outputs], device=device)
     else:
@@ -96,7 +102,8 @@ def weigh_ids(
             height,
             state,
         ]
-        launch(lifting_lanes.lift_ids, lists.tile_count, inputs, outputs, device=device, slots=True)
+        kernel = lifting_lanes.make_lift_ids(squared)
+        launch(kernel, lists.tile_count, inputs, outputs, device=device, slots=True)
     where = [view(t, wp.int32) for t in (lists.entries, lists.places, starts, lists.tiles)]
     return [*where, view(local.tile_ids, wp.int32), view(local.counts, wp.int32), view(weights, wp.float32)]
 

@@ -19,6 +19,7 @@ from sgwarp.errors import InputError
 
 INSTALL = 'pip install "sgwarp[conse]"'
 BATCH = 64
+LEAST_LIKENESS = 0.56  # of a phrase with the name of some class: "floor", "ceiling" and "sky" lie below
 
 
 class ConseText(Phrases):
@@ -35,6 +36,18 @@ class ConseText(Phrases):
     def __init__(self, templates: Sequence[str] = PLAIN) -> None:
         super().__init__(SPACE, encode_sentences, templates, imagenet_space().place_texts)
         _sentence_model()
+
+
+def have_counterparts(texts: Sequence[str]) -> Tensor:
+    """Phrases that come close to the name of some class of ImageNet, bool [Q]: the classifier can tell these."""
+    likeness = _likeness(tuple(text.strip() for text in texts))
+    return likeness >= LEAST_LIKENESS
+
+
+@cache
+def _likeness(texts: tuple[str, ...]) -> Tensor:
+    """Largest cosine of each phrase with the name of a class, float32 [Q]."""
+    return (encode_sentences(texts) @ imagenet_space().embeddings.T).amax(dim=1)
 
 
 def encode_sentences(sentences: Sequence[str]) -> Tensor:
