@@ -18,6 +18,7 @@ from sgwarp.runs.progress import Report
 from sgwarp.scene import Gaussians, Semantics, View
 
 Kind = Literal["mode", "rival", "images"]
+METHOD_KINDS: tuple[str, ...] = get_args(Kind)
 
 ABOUT_MODES = {
     "weighted": "all pixels a Gaussian contributes to, by its weight there",

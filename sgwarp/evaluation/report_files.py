@@ -167,8 +167,8 @@ def _page(found: Evaluation, tables: Sequence[Table]) -> str:
     settings = found.settings
     about = (
         f"{found.profile.about[0].upper()}{found.profile.about[1:]}. sgwarp {__version__}, device {settings.device}, "
-        f"encoder `{settings.encoder}`, method `{settings.method}`, views `{settings.views}`. Figures are percent, except "
-        "seconds, bytes and the residual."
+        f"encoder `{settings.encoder}`, method `{settings.method}`, views `{settings.views}`. "
+        "Figures are percent, except seconds, bytes and the residual."
     )
     parts = [f"# Evaluation: {found.profile.name}", about, *(table.markdown() for table in tables)]
     if found.profile.differences:
