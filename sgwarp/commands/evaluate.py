@@ -25,7 +25,21 @@ class Evaluate(Options):
     In names of files and encoders, {scene} is a scene's name and {path} its folder.
     """
 
-    profile: tyro.conf.Positional[Literal["room",]]
+    profile: tyro.conf.Positional[
+        Literal[
+            "room",
+            "scannet12-2d",
+            "scannet-3d",
+            "lerf-ovs-loc",
+            "lerf-ovs-seg",
+            "lerf-ovs-3d",
+            "lerf-mask",
+            "nvos",
+            "spin-nerf",
+            "parts",
+            "panoptic-4d",
+        ]
+    ]
     """The protocol."""
 
     data: Path
@@ -43,7 +57,7 @@ class Evaluate(Options):
     levels: tuple[str, ...] = ()
     """What {level} in --encoder stands for, one after the other: maps of several levels that are lifted apart."""
 
-    method: str | None = None
+    method: str = "weighted"
     """A lift mode, a rival, or 2d: the encoder on the scored view itself."""
 
     gaussians: str = ""
@@ -60,6 +74,9 @@ class Evaluate(Options):
 
     scoring: Literal["evidence", "cosine"] | None = None
     """As for `sgwarp segment`."""
+
+    classes: tuple[str, ...] = ()
+    """Names to ask for, where the data set names none."""
 
     threshold: float | None = None
     """Score above which a Gaussian is selected by a phrase: 0 is the scene's median, 1 its best thousandth."""
@@ -81,6 +98,9 @@ class Evaluate(Options):
 
     count: int = 100_000
     """Gaussians that are made of depth images, where there is no trained scene."""
+
+    forgetting: float = 0.9
+    """Of moving scenes: weight of the past after one more frame; 0 takes every frame alone, as the paper does."""
 
     sheets: int = 3
     """Views to draw per scene."""
@@ -128,12 +148,22 @@ class Evaluate(Options):
         given = {name: getattr(self, name) for name in (one.name for one in fields(Settings)) if hasattr(self, name)}
         chosen = {**profile.defaults, **{name: value for name, value in given.items() if value is not None}}
         chosen["cache"] = None if self.cache == "none" else self.cache or str(default_folder())
+        self._require_encoder(chosen.get("encoder", ""))
         try:
             settings = Settings(**chosen)
         except InputError as error:
             raise InputError(f"--{error}") from None
         find_method(settings.method)
         return settings
+
+    def _require_encoder(self, name: str) -> None:
+        """Refuse an encoder that stands for weights that nobody named.
+
+        Raises:
+            InputError: It was not given, and the protocol's own needs weights.
+        """
+        if not self.semantics and name.rpartition(":")[2] in ("PATH", "DIR"):
+            raise InputError(f"--encoder: profile {self.profile} is published with {name}; name one, with its weights")
 
     @staticmethod
     def _say_failed(found: Evaluation) -> None:

@@ -16,10 +16,12 @@ from pathlib import Path
 from sgwarp.datasets.base import (
     Query,
     SceneData,
+    Scribbles,
     absent,
     folders_in,
     image_stems,
     images_in,
+    mask_of,
     query_of_mask,
     scene_folder,
     trained_in,
@@ -53,6 +55,10 @@ def open_scene(root: Path, name: str) -> SceneData:
     def queries() -> list[Query]:
         return [query_of_mask(path.stem, name, path, 0) for path in masks]
 
+    def scribbles() -> Scribbles:
+        mask = mask_of(masks[0], 0)
+        return Scribbles(masks[0].stem, mask, ~mask)
+
     return SceneData(
         name,
         folder,
@@ -61,5 +67,6 @@ def open_scene(root: Path, name: str) -> SceneData:
         load_views=lambda: load_views(folder),
         labelled=tuple(path.stem for path in masks),
         load_queries=queries,
+        load_scribbles=scribbles,
         gaussians=trained_in(folder),
     )

@@ -37,29 +37,38 @@ class Answers:
             with case.log.stage("answer"):
                 return self._labels_of_map(view, tuple(classes))
         first = case.semantics[0]
-        if self._votes is None or self._votes[0] != tuple(classes):
+        asked = [name for name in classes if first.labels is None or name in first.labels]  # no view shows the others
+        if self._votes is None or self._votes[0] != tuple(asked):
             with case.log.stage("query"):
                 options = {"predicted": case.predicted, "ensemble": case.settings.ensemble}
-                votes = class_votes(first, classes, case.text, scoring=case.settings.scoring, **options)  # type: ignore[arg-type]
-                self._votes = tuple(classes), votes
+                votes = class_votes(first, asked, case.text, scoring=case.settings.scoring, **options)  # type: ignore[arg-type]
+                self._votes = tuple(asked), votes
         with case.log.stage("answer"):
             seen = seen_by(first, case.predicted, case.settings.ensemble)
-            return segment_votes(case.gaussians, view.camera, self._votes[1], seen)[0].cpu()
+            channel = segment_votes(case.gaussians, view.camera, self._votes[1], seen)[0].cpu()
+        return torch.tensor([*(list(classes).index(name) for name in asked), -1])[channel]
 
-    def relevancy(self, view: View, texts: Sequence[str]) -> Tensor:
-        """Relevancy of phrases by level, 0 where nothing is known, float32 [L, Q, H, W]."""
-        case = self.case
+    def relevancy(self, view: View, texts: Sequence[str], among: Sequence[str] | None = None) -> Tensor:
+        """Relevancy of phrases by level, 0 where nothing is known, float32 [L, Q, H, W].
+
+        Args:
+            view: The view.
+            texts: Q phrases.
+            among: All phrases that the scene will be asked, so that Gaussians are scored once; `texts` if None.
+        """
+        case, every = self.case, tuple(among or texts)
         if not case.semantics:
             with case.log.stage("answer"):
                 return torch.cat([self._relevancy_of_map(source, view, texts) for source in case.sources])
-        if self._scores is None or self._scores[0] != tuple(texts):
+        if self._scores is None or self._scores[0] != every:
             with case.log.stage("query"):
-                self._scores = tuple(texts), [self._score(one, texts) for one in case.semantics]
+                self._scores = every, [self._score(one, every) for one in case.semantics]
+        columns = [every.index(text) for text in texts]
         with case.log.stage("answer"):
             maps = []
             for one, scores in zip(case.semantics, self._scores[1], strict=True):
                 seen = seen_by(one, case.predicted, case.settings.ensemble)
-                mean, known = splat_scores(case.gaussians, view.camera, scores, seen)
+                mean, known = splat_scores(case.gaussians, view.camera, scores[:, columns], seen)
                 maps.append(torch.where(known[..., None], mean, 0.0).permute(2, 0, 1).cpu())
             return torch.stack(maps)
 

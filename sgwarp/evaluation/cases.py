@@ -68,10 +68,7 @@ def prepare(scene: SceneData, settings: Settings, split: Split, log: RunLog) -> 
     """
     with log.stage("read"):
         views = scene.need("views")()
-        train, scored = split(scene, views, settings)
-    if not scored:
-        raise InputError(f"{scene.folder}: scene {scene.name} has no view to score; `sgwarp info` says what is missing")
-    lifted = train[:: settings.every]
+        lifted, scored = split(scene, views, settings)
     gaussians = _gaussians(scene, settings, lifted, log)
     case = Case(scene, settings, gaussians, lifted, scored, log)
     if settings.predicted:
@@ -166,9 +163,16 @@ def _on(semantics: Semantics, gaussians: Gaussians) -> Semantics:
 
 
 def split_by_number(scene: SceneData, views: Sequence[View], settings: Settings) -> tuple[list[View], list[View]]:
-    """Every `hold_out`-th view is scored and not lifted; with views="released", it is lifted, too."""
+    """Every `hold_out`-th view is scored and not lifted; with views="released", it is lifted, too.
+
+    Raises:
+        InputError: None of them is labelled.
+    """
     scored = [view for index, view in enumerate(views) if index % settings.hold_out == 0]
-    return _train(views, scored, settings), [view for view in scored if view.stem in scene.labelled]
+    labelled = [view for view in scored if view.stem in scene.labelled]
+    if not labelled:
+        raise InputError(f"{scene.folder}: scene {scene.name} has no label image of a view to score; see `sgwarp info`")
+    return _train(views, scored, settings), labelled
 
 
 def split_by_label(scene: SceneData, views: Sequence[View], settings: Settings) -> tuple[list[View], list[View]]:
@@ -180,13 +184,30 @@ def split_by_label(scene: SceneData, views: Sequence[View], settings: Settings) 
     named = set(scene.labelled)
     scored = [view for view in views if view.stem in named]
     if not scored:
-        some = ", ".join(scene.labelled[:3])
-        raise InputError(f"{scene.folder}: no view has the name of a labelled one ({some}, ...); rename one of them")
+        some = ", ".join(scene.labelled[:3]) or "none"
+        raise InputError(f"{scene.folder}: no view has the name of a labelled one ({some}); rename one of them")
     return _train(views, scored, settings), scored
 
 
+def split_by_every(scene: SceneData, views: Sequence[View], settings: Settings) -> tuple[list[View], list[View]]:
+    """Every `every`-th view is lifted; all labelled ones are scored, with views="strict" only those not lifted.
+
+    Raises:
+        InputError: None is left to score.
+    """
+    lifted = list(views[:: settings.every])
+    stems = {view.stem for view in lifted} if settings.views == "strict" else set()
+    scored = [view for view in views if view.stem in scene.labelled and view.stem not in stems]
+    if not scored:
+        raise InputError(f"{scene.folder}: scene {scene.name} has no labelled view that is not lifted; raise --every")
+    return lifted, scored
+
+
+def split_without_views(scene: SceneData, views: Sequence[View], settings: Settings) -> tuple[list[View], list[View]]:
+    """Every `every`-th view is lifted; none is scored: the truth is in 3D."""
+    return list(views[:: settings.every]), []
+
+
 def _train(views: Sequence[View], scored: Sequence[View], settings: Settings) -> list[View]:
-    if settings.views == "released":
-        return list(views)
-    stems = {view.stem for view in scored}
-    return [view for view in views if view.stem not in stems]
+    stems = set() if settings.views == "released" else {view.stem for view in scored}
+    return [view for view in views if view.stem not in stems][:: settings.every]

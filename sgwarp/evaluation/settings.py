@@ -26,6 +26,7 @@ class Settings:
         predicted: By `sgwarp predict`, asked together with the lifted semantics.
         ensemble: How the two become one.
         scoring: Of classes, see `class_votes`.
+        classes: Names to ask for, where the data set names none.
         threshold: Of `score_texts`, above which a Gaussian is selected.
         views: "strict" never lifts from views that are scored; "released" lifts all, as the published scripts do.
         hold_out: Every so many views is kept for scoring, where the data set does not say which.
@@ -33,6 +34,7 @@ class Settings:
         share_of_views: Lift from this share of them.
         share_of_gaussians: Keep this share, at random, and enlarge what is kept so that surfaces stay closed.
         count: Gaussians made of depth images.
+        forgetting: Of moving scenes, weight of the past after one more frame; 0 takes every frame alone.
         sheets: Views to draw per scene.
         seed: Of noise and shares.
         device: Where to compute.
@@ -47,6 +49,7 @@ class Settings:
     predicted: str = ""
     ensemble: Ensemble = "max"
     scoring: Scoring = "cosine"
+    classes: tuple[str, ...] = ()
     threshold: float = 0.5
     views: Views = "strict"
     hold_out: int = 8
@@ -54,6 +57,7 @@ class Settings:
     share_of_views: float = 1.0
     share_of_gaussians: float = 1.0
     count: int = 100_000
+    forgetting: float = 0.9
     sheets: int = 3
     seed: int = 0
     device: str = "cpu"
@@ -74,4 +78,4 @@ class Settings:
         """What a scene's results depend on: all but where they are computed and kept."""
         chosen = asdict(self)
         del chosen["device"], chosen["cache"]
-        return chosen | {"levels": list(self.levels)}
+        return chosen | {"levels": list(self.levels), "classes": list(self.classes)}

@@ -15,7 +15,7 @@ from sgwarp.metrics.overlap import macro, mean, micro
 from sgwarp.metrics.segmentation import ConfusionMatrix
 from sgwarp.runs.log import RunLog
 
-Score = Callable[[Case, SceneResult, Path], None]  # fills in the figures and draws sheets into a folder
+Score = Callable[[Any, SceneResult, Path], None]  # fills in the figures and draws sheets into a folder
 Total = Callable[[Sequence[SceneResult]], dict[str, float]]
 
 
@@ -52,7 +52,7 @@ class Profile:
     split: Split = split_by_number
     defaults: Mapping[str, Any] = field(default_factory=dict)
     differences: tuple[str, ...] = ()
-    make: Callable[[SceneData, Settings, Split, RunLog], Case] = prepared
+    make: Callable[[SceneData, Settings, Split, RunLog], Any] = prepared
 
 
 def add_confusion(result: SceneResult, matrix: ConfusionMatrix, classes: Sequence[str]) -> None:

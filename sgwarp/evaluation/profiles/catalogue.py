@@ -9,6 +9,16 @@ from sgwarp.evaluation.profiles.base import Profile
 
 PLACES = {
     "room": "room:ROOM",
+    "scannet12-2d": "scannet:FRAMES",
+    "scannet-3d": "scannet:POINTS",
+    "lerf-ovs-loc": "lerf_ovs:LOCATION",
+    "lerf-ovs-seg": "lerf_ovs:SEGMENTATION",
+    "lerf-ovs-3d": "lerf_ovs:SELECTION",
+    "lerf-mask": "masks:LERF_MASK",
+    "nvos": "masks:NVOS",
+    "spin-nerf": "masks:SPIN_NERF",
+    "parts": "parts:PARTS",
+    "panoptic-4d": "panoptic:PANOPTIC",
 }
 
 
