@@ -3,16 +3,14 @@
 from __future__ import annotations
 
 import os
-import resource
 import signal
-import sys
 import threading
 import time
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager, suppress
-from pathlib import Path
+from contextlib import contextmanager
 
 from sgwarp.cluster.tasks import Limits
+from sgwarp.runs.memory import reset_peak, resident
 
 INTERVAL = 0.1  # seconds between two looks
 GRACE = 5.0  # seconds after the time limit until the system ends a process whose interpreter is stuck
@@ -75,26 +73,3 @@ def end_with(parent: int) -> None:
         os._exit(1)
 
     threading.Thread(target=watch, name="sgwarp-parent", daemon=True).start()
-
-
-def resident() -> int:
-    """Bytes of memory that this process holds now; 0 where the system does not say."""
-    try:
-        return int(Path("/proc/self/statm").read_text().split()[1]) * resource.getpagesize()
-    except (OSError, ValueError, IndexError):
-        return 0
-
-
-def reset_peak() -> None:
-    """Let `peak` count from now on, on Linux."""
-    with suppress(OSError):
-        Path("/proc/self/clear_refs").write_text("5")
-
-
-def peak() -> int:
-    """Most bytes that this process has held since `reset_peak`, elsewhere than on Linux since its start."""
-    with suppress(OSError, ValueError, IndexError):
-        lines = Path("/proc/self/status").read_text().splitlines()
-        return next(int(line.split()[1]) * 1024 for line in lines if line.startswith("VmHWM:"))
-    most = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
-    return most if sys.platform == "darwin" else most * 1024

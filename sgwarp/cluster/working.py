@@ -15,8 +15,9 @@ from typing import Any
 
 from sgwarp.cluster.records import DONE, FAILED, STAGES, Place, fingerprint, read_json, unchanged, write_json
 from sgwarp.cluster.tasks import OUT, Outcome, Task, named_function
-from sgwarp.cluster.watching import peak, watched
+from sgwarp.cluster.watching import watched
 from sgwarp.errors import InputError, printable
+from sgwarp.runs.memory import peak
 from sgwarp.version import __version__
 
 LOG = "log.txt"  # what the commands of a scene have printed

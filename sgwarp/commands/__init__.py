@@ -9,6 +9,7 @@ from sgwarp.commands.demo import Demo
 from sgwarp.commands.distill import Distill
 from sgwarp.commands.edit import Edit
 from sgwarp.commands.encoders import Encoders
+from sgwarp.commands.evaluate import Evaluate
 from sgwarp.commands.fit import Fit
 from sgwarp.commands.info import Info
 from sgwarp.commands.instances import Instances
@@ -37,6 +38,7 @@ COMMANDS = {
     "info": Info,
     "convert": Convert,
     "encoders": Encoders,
+    "evaluate": Evaluate,
     "report": Report,
     "demo": Demo,
 }

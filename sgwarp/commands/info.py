@@ -1,4 +1,4 @@
-"""`sgwarp info`: what a scene, and what its semantics hold."""
+"""`sgwarp info`: what a scene and its semantics hold, or what a data set has and lacks."""
 
 from __future__ import annotations
 
@@ -21,16 +21,24 @@ class Info(SceneOptions):
     """Print what a scene holds: count, bounds, harmonics, opacities, rows that cannot be rendered; its semantics.
 
     Of a moving scene (params.npz, a folder of .ply files): frames, identity of the Gaussians, and how much moves.
+    Of a data set: its scenes, their photographs and labels, and what is missing.
     """
 
     semantics: Path | None = None
     """What `sgwarp lift` wrote for this scene."""
+
+    data_set: str | None = None
+    """Read the folder as this data set; found out by its files if not given."""
 
     json: bool = False
     """Print JSON instead of lines."""
 
     def run(self) -> None:
         log = self.start()
+        facts = self._data_set_facts()
+        if facts is not None:
+            self._show(facts)
+            return
         if self.scene.suffix == ".npz" or self.scene.is_dir():
             self._show(self._sequence_facts())
             return
@@ -38,10 +46,28 @@ class Info(SceneOptions):
         from sgwarp.io.scenes import find_format
 
         form = find_format(self.scene)
-        facts: dict[str, Any] = {"scene": str(self.scene), "format": form.name, **scene_facts(gaussians)}
+        facts = {"scene": str(self.scene), "format": form.name, **scene_facts(gaussians)}
         if self.semantics is not None:
             facts["semantics"] = semantics_facts(self.semantics, gaussians)
         self._show(facts)
+
+    def _data_set_facts(self) -> dict[str, Any] | None:
+        """Scenes of a data set; None if the path is none.
+
+        Raises:
+            InputError: It is not the data set that was named.
+        """
+        from sgwarp.datasets.catalogue import describe_data_set, detect_reader, find_reader
+
+        if self.data_set is not None:
+            reader = find_reader(self.data_set)
+            if not reader.list_scenes(self.scene):
+                raise InputError(f"{self.scene}: holds no scene of '{reader.NAME}'; expected {reader.ABOUT}")
+            return describe_data_set(self.scene, reader)
+        if not self.scene.is_dir() or (self.scene / "params.npz").is_file() or self.semantics is not None:
+            return None
+        found = detect_reader(self.scene)
+        return None if found is None else describe_data_set(self.scene, found)
 
     def _sequence_facts(self) -> dict[str, Any]:
         """Frames, identity and motion of a moving scene.

@@ -29,6 +29,8 @@ class Room:
         pieces: Number of the wall, floor or piece of furniture that every Gaussian belongs to, int64 [N].
         class_of_piece: Index into CLASSES, int64 [P].
         size: Width, height and depth [m].
+        faces: Corner and two sides of every parallelogram that the room is made of [m], float32 [F, 3, 3].
+        piece_of_face: Piece that each belongs to, int64 [F].
     """
 
     gaussians: Gaussians
@@ -36,6 +38,8 @@ class Room:
     pieces: Tensor
     class_of_piece: Tensor
     size: tuple[float, float, float]
+    faces: Tensor
+    piece_of_face: Tensor
 
 
 @dataclass
@@ -209,7 +213,9 @@ def _cover(build: _Builder, count: int, size: tuple[float, float, float]) -> Roo
         sh=((colours.clamp(0, 1) - 0.5) / SH_C0)[:, None],
     )
     class_of_piece = torch.tensor(build.class_of_piece)
-    return Room(gaussians, class_of_piece[pieces], pieces, class_of_piece, size)
+    faces = torch.cat([corners[:, None], sides], dim=1)
+    classes = class_of_piece[pieces]
+    return Room(gaussians, classes, pieces, class_of_piece, size, faces, torch.tensor(build.pieces))
 
 
 def _facing(normals: Tensor, spin: Tensor) -> Tensor:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -55,6 +56,24 @@ class ConfusionMatrix:
         flat = torch.bincount(truth * (self.classes + 1) + predicted, minlength=self.counts.numel())
         self.counts += flat.reshape(self.counts.shape)
 
+    def merge(self, other: ConfusionMatrix) -> None:
+        """Add the pixels of another matrix of the same classes.
+
+        Raises:
+            InputError: It has another number of classes.
+        """
+        if other.classes != self.classes:
+            raise InputError(f"confusion matrices: {self.classes} and {other.classes} classes cannot be added up")
+        self.counts += other.counts
+
+    @classmethod
+    def of_counts(cls, counts: Any) -> ConfusionMatrix:
+        """A matrix from its counts, [Q, Q + 1], as a list or tensor."""
+        table = torch.as_tensor(counts, dtype=torch.int64)
+        if table.ndim != 2 or table.shape[1] != table.shape[0] + 1:
+            raise InputError(f"counts: expected shape [Q, Q + 1], got {list(table.shape)}")
+        return cls(len(table), table.clone())
+
     @property
     def present(self) -> Tensor:
         """Classes that the truth holds, bool [Q]."""
@@ -86,6 +105,17 @@ class ConfusionMatrix:
     def pixel_accuracy(self) -> float:
         """Share of the scored pixels that are right; NaN if there are none."""
         return float(self.counts.diagonal().sum().double() / self.counts.sum())
+
+    @property
+    def precision(self) -> Tensor:
+        """Share of the scored pixels called a class that are of it, float64 [Q]; NaN for a class never called."""
+        return self.counts.diagonal().double() / self.counts[:, : self.classes].sum(dim=0)
+
+    @property
+    def frequency_weighted_iou(self) -> float:
+        """Mean IoU over the classes that are present, by their pixels; NaN if no pixel was scored."""
+        share = self.counts.sum(dim=1)[self.present].double()
+        return float((self.iou[self.present] * share).sum() / share.sum())
 
     @property
     def unknown(self) -> float:

@@ -1,9 +1,14 @@
 """Procedural rooms: repeatable, varied, and labelled as they are built."""
 
+from dataclasses import replace
+
 import pytest
 import torch
 
+from sgwarp.datasets.labelled_folder import open_scene
 from sgwarp.datasets.synthetic import CLASSES, FURNITURE, make_room, room_cameras
+from sgwarp.datasets.synthetic_files import room_truth, save_room
+from sgwarp.io.scenes import load_gaussians
 from sgwarp.ops.reference.rasterizer import rotation_matrices
 from sgwarp.rendering.renderer import render
 
@@ -55,3 +60,36 @@ def test_cameras_see_the_room(rooms):
         assert bool((camera.position > 0).all())
         assert bool((camera.position < torch.tensor(rooms[0].size)).all())
         assert float(render(rooms[0].gaussians, camera, "alpha").mean()) > 0.8
+
+
+def test_truth_of_a_ray_is_the_first_thing_on_it(rooms):
+    """Rays through centers of Gaussians, one camera of one pixel each: a face lies there, or something before it."""
+    room = rooms[2]
+    camera = room_cameras(room, 5, 3, 80, 60)[1]
+    points = room.gaussians.means.double() @ camera.world_to_camera[:3, :3].T + camera.world_to_camera[:3, 3]
+    chosen = (points[:, 2] > 0.3).nonzero().flatten()[::60]
+    same = []
+    for index in chosen.tolist():
+        K = camera.K.clone()
+        K[:2, 2] = 0.5 - K[[0, 1], [0, 1]] * points[index, :2] / points[index, 2]
+        classes, depth = room_truth(room, replace(camera, K=K, width=1, height=1))
+        behind = float(points[index, 2] - depth[0, 0])
+        assert behind > -0.1  # centers lie on faces, but for their noise along the normal and grazing rays
+        if abs(behind) < 0.02:  # the noise has a deviation of 8 mm
+            same.append(int(classes[0, 0]) == int(room.classes[index]))
+    assert len(same) > 15
+    assert all(same)
+    classes, depth = room_truth(room, camera)
+    assert bool((classes >= 0).all())  # the room is closed
+    assert float(depth.min()) > 0
+
+
+def test_a_saved_room_reads_back(rooms, tmp_path):
+    save_room(rooms[0], tmp_path, 2, 32, 24)
+    scene = open_scene(tmp_path, tmp_path.name)
+    views = scene.load_views()
+    classes, depth = room_truth(rooms[0], views[1].camera)
+    assert torch.equal(scene.load_labels("0001"), classes)
+    assert torch.allclose(torch.from_numpy(scene.load_depth(views[1])).double(), depth, atol=6e-4)
+    assert scene.classes == CLASSES
+    assert load_gaussians(scene.gaussians).extras["label"].tolist() == rooms[0].classes.tolist()

@@ -85,3 +85,57 @@ def test_hits():
     assert hits_box(scores, [(2, 2, 3, 3), (0, 3, 0, 3)])
     assert not hits_box(scores, [(1, 0, 3, 3)])
     assert not hits_box(torch.full((4, 6), -torch.inf), [(0, 0, 6, 4)])
+
+
+def test_against_torchmetrics():
+    """The same labels through another library; a label outside the classes is what it calls ignored."""
+    import warnings
+
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        segmentation = pytest.importorskip("torchmetrics.functional.classification")
+    rng = torch.Generator().manual_seed(9)
+    truth = torch.randint(0, 5, (3, 40, 50), generator=rng)
+    predicted = torch.where(
+        torch.rand(3, 40, 50, generator=rng) < 0.6, truth, torch.randint(0, 5, (3, 40, 50), generator=rng)
+    )
+    truth[torch.rand(3, 40, 50, generator=rng) < 0.1] = 255
+    matrix = ConfusionMatrix.empty(5)
+    for one, other in zip(predicted, truth, strict=True):
+        matrix.add(one, other)
+    options = {"num_classes": 5, "ignore_index": 255}
+    jaccard = segmentation.multiclass_jaccard_index(predicted, truth, average=None, **options)
+    weighted = segmentation.multiclass_jaccard_index(predicted, truth, average="weighted", **options)
+    recall = segmentation.multiclass_recall(predicted, truth, average=None, **options)
+    precision = segmentation.multiclass_precision(predicted, truth, average=None, **options)
+    assert torch.allclose(matrix.iou.float(), jaccard)
+    assert torch.allclose(matrix.accuracy.float(), recall)
+    assert torch.allclose(matrix.precision.float(), precision)
+    assert matrix.miou == pytest.approx(float(jaccard.mean()))
+    assert matrix.macc == pytest.approx(float(recall.mean()))
+    assert matrix.frequency_weighted_iou == pytest.approx(float(weighted))
+
+
+def test_scenes_add_up_and_counts_come_back():
+    rng = torch.Generator().manual_seed(2)
+    whole, parts = ConfusionMatrix.empty(3), [ConfusionMatrix.empty(3), ConfusionMatrix.empty(3)]
+    for part in parts:
+        p, t = torch.randint(-1, 3, (2, 8, 8), generator=rng)
+        part.add(p, t)
+        whole.add(p, t)
+    total = ConfusionMatrix.of_counts(parts[0].counts.tolist())
+    total.merge(parts[1])
+    assert torch.equal(total.counts, whole.counts)
+    with pytest.raises(InputError, match="cannot be added"):
+        total.merge(ConfusionMatrix.empty(4))
+    with pytest.raises(InputError, match="shape"):
+        ConfusionMatrix.of_counts([[1, 2], [3, 4]])
+
+
+def test_a_class_that_is_not_present_does_not_count_and_an_ignored_one_costs_nothing():
+    """Truth: class 0 and the ignored 2. Calling ignored pixels class 1 is free; class 1 is not present."""
+    matrix = ConfusionMatrix.empty(2)
+    matrix.add(torch.tensor([[0, 0, 1, 1]]), torch.tensor([[0, 0, 2, 2]]))
+    assert (matrix.miou, matrix.macc) == (1.0, 1.0)
+    matrix.add(torch.tensor([[1, 1]]), torch.tensor([[0, 0]]))  # now half of class 0 is called 1
+    assert matrix.miou == pytest.approx(0.5)  # and class 1, predicted but absent, is not averaged in

@@ -1,0 +1,171 @@
+"""`sgwarp evaluate`: published protocols on data sets, with the ablations of the paper."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Literal
+
+import tyro
+
+from sgwarp.commands.options import Options, check_folder
+from sgwarp.errors import InputError
+from sgwarp.runs.progress import show_progress
+
+if TYPE_CHECKING:
+    from sgwarp.evaluation.evaluator import Evaluation
+    from sgwarp.evaluation.profiles.base import Profile
+    from sgwarp.evaluation.settings import Settings
+
+
+@dataclass(kw_only=True)
+class Evaluate(Options):
+    """Score the scenes of a data set by a protocol, beside published figures; a killed run goes on where it was.
+
+    In names of files and encoders, {scene} is a scene's name and {path} its folder.
+    """
+
+    profile: tyro.conf.Positional[
+        Literal[
+            "room",
+            "scannet12-2d",
+            "scannet-3d",
+            "lerf-ovs-loc",
+            "lerf-ovs-seg",
+            "lerf-ovs-3d",
+            "lerf-mask",
+            "nvos",
+            "spin-nerf",
+            "parts",
+            "panoptic-4d",
+        ]
+    ]
+    """The protocol."""
+
+    data: Path
+    """Root of the data set; `sgwarp info DATA` says what is there and what is missing."""
+
+    out: Path
+    """Folder for results.md, results.json, results.tex and scenes/{scene}/."""
+
+    scenes: tuple[str, ...] = ()
+    """Names; if not given, those of the published list that are there."""
+
+    encoder: str | None = None
+    """As for `sgwarp lift`; or truth, truth?noise=0.15: the data's own label images, with a share of regions wrong."""
+
+    levels: tuple[str, ...] = ()
+    """What {level} in --encoder stands for, one after the other: maps of several levels that are lifted apart."""
+
+    method: str = "weighted"
+    """A lift mode, a rival, or 2d: the encoder on the scored view itself."""
+
+    gaussians: str = ""
+    """Trained scenes, such as fitted/{scene}/scene.ply; if not given, what lies with the data, or made of depth."""
+
+    semantics: str = ""
+    """What `sgwarp lift` wrote, such as lifted/{scene}.safetensors; then nothing is lifted."""
+
+    predicted: str = ""
+    """What `sgwarp predict` wrote, to be asked together with the lifted semantics."""
+
+    ensemble: Literal["2d", "3d", "max", "sum", "mean"] = "max"
+    """As for `sgwarp segment`."""
+
+    scoring: Literal["evidence", "cosine"] | None = None
+    """As for `sgwarp segment`."""
+
+    classes: tuple[str, ...] = ()
+    """Names to ask for, where the data set names none."""
+
+    threshold: float | None = None
+    """Score above which a Gaussian is selected by a phrase: 0 is the scene's median, 1 its best thousandth."""
+
+    views: Literal["released", "strict"] | None = None
+    """strict: views that are scored are not lifted; released: all are, as in the published scripts."""
+
+    hold_out: int | None = None
+    """Score every so many views, where the data set does not say which."""
+
+    every: int | None = None
+    """Lift every so many of the training views."""
+
+    share_of_views: float = 1.0
+    """Lift this share of them."""
+
+    share_of_gaussians: float = 1.0
+    """Keep this share of the Gaussians, at random, enlarged so that surfaces stay closed."""
+
+    count: int = 100_000
+    """Gaussians that are made of depth images, where there is no trained scene."""
+
+    forgetting: float = 0.9
+    """Of moving scenes: weight of the past after one more frame; 0 takes every frame alone, as the paper does."""
+
+    sheets: int = 3
+    """Views to draw per scene."""
+
+    seed: int = 0
+    """Of noise and shares."""
+
+    cache: str = ""
+    """As for `sgwarp lift`."""
+
+    def run(self) -> int:
+        """Returns the exit code, 1 if a scene failed."""
+        check_folder("--out", self.out)
+        with self.logged(self.out) as log:
+            from sgwarp.evaluation.evaluator import evaluate
+            from sgwarp.evaluation.profiles.catalogue import find_profile
+            from sgwarp.evaluation.report_files import headline, write_tables
+
+            profile = find_profile(self.profile)
+            settings = self._settings(profile)
+            with show_progress("evaluate") as progress:
+                found = evaluate(
+                    profile, self.data, self.out, settings, scenes=self.scenes or None, log=log, progress=progress
+                )
+            paths = write_tables(found, self.out)
+            log.error |= {name: value for name, value in found.figures.items()}
+            log.error["failed"] = len(found.failed)
+            log.outputs += [str(path) for path in paths]
+            print(headline(found).markdown())
+            self._say_failed(found)
+        return 1 if found.failed else 0
+
+    def _settings(self, profile: Profile) -> Settings:
+        """The profile's defaults, and what was said on the command line.
+
+        Raises:
+            InputError: A value is out of range.
+        """
+        from dataclasses import fields
+
+        from sgwarp.encoders.cache import default_folder
+        from sgwarp.evaluation.methods import find_method
+        from sgwarp.evaluation.settings import Settings
+
+        given = {name: getattr(self, name) for name in (one.name for one in fields(Settings)) if hasattr(self, name)}
+        chosen = {**profile.defaults, **{name: value for name, value in given.items() if value is not None}}
+        chosen["cache"] = None if self.cache == "none" else self.cache or str(default_folder())
+        self._require_encoder(chosen.get("encoder", ""))
+        try:
+            settings = Settings(**chosen)
+        except InputError as error:
+            raise InputError(f"--{error}") from None
+        find_method(settings.method)
+        return settings
+
+    def _require_encoder(self, name: str) -> None:
+        """Refuse an encoder that stands for weights that nobody named.
+
+        Raises:
+            InputError: It was not given, and the protocol's own needs weights.
+        """
+        if not self.semantics and name.rpartition(":")[2] in ("PATH", "DIR"):
+            raise InputError(f"--encoder: profile {self.profile} is published with {name}; name one, with its weights")
+
+    @staticmethod
+    def _say_failed(found: Evaluation) -> None:
+        for name, error in found.failed.items():
+            print(f"{name}: {error}")

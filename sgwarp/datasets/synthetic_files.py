@@ -1,0 +1,108 @@
+"""A generated room as a labelled folder: photographs rendered, labels and depth by rays, without any Gaussians."""
+
+from __future__ import annotations
+
+import json
+import os
+from collections.abc import Sequence
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from sgwarp.datasets.synthetic import CLASSES, Room, room_cameras
+from sgwarp.files.atomic import atomic_path
+from sgwarp.files.images import write_ids, write_rgb
+from sgwarp.io.scenes import save_gaussians
+from sgwarp.ops.splatting.forward import rasterize
+from sgwarp.scene import Camera
+
+FACES_AT_ONCE = 64
+LABEL = "label"  # column of the scene's PLY file: class of each Gaussian
+
+
+def room_truth(room: Room, camera: Camera) -> tuple[Tensor, Tensor]:
+    """What a camera sees by intersecting the ray of each pixel's center with the faces of the room.
+
+    Returns:
+        classes: Index into CLASSES, -1 where the ray leaves the room, int64 [H, W].
+        depth: Along the optical axis [m], 0 where the ray leaves the room, float64 [H, W].
+    """
+    y, x = torch.meshgrid(*(torch.arange(n, dtype=torch.float64) + 0.5 for n in camera.size), indexing="ij")
+    rays = torch.stack([x, y, torch.ones_like(x)], dim=2).reshape(-1, 3) @ torch.linalg.inv(camera.K).T
+    rays = rays @ camera.world_to_camera[:3, :3]  # z along the optical axis stays 1: the distance is the depth
+    nearest = torch.full((len(rays),), torch.inf, dtype=torch.float64)
+    piece = torch.full((len(rays),), -1, dtype=torch.int64)
+    for start in range(0, len(room.faces), FACES_AT_ONCE):
+        corner, u, v = room.faces[start : start + FACES_AT_ONCE].double().unbind(1)
+        normal = torch.linalg.cross(u, v)
+        depth = ((corner - camera.position) * normal).sum(1) / (rays @ normal.T)  # [rays, faces]
+        point = camera.position + depth[..., None] * rays[:, None] - corner
+        a, b = (_share(point, one, torch.linalg.cross(other, normal)) for one, other in ((u, v), (v, u)))
+        inside = (a >= 0) & (a <= 1) & (b >= 0) & (b <= 1) & (depth > camera.near)
+        best, face = torch.where(inside, depth, torch.inf).min(dim=1)
+        piece = torch.where(best < nearest, room.piece_of_face[start + face], piece)
+        nearest = torch.minimum(nearest, best)
+    seen = torch.isfinite(nearest)
+    classes = torch.where(seen, room.class_of_piece[piece], -1)
+    return classes.view(camera.size), torch.where(seen, nearest, 0.0).view(camera.size)
+
+
+def _share(point: Tensor, side: Tensor, across: Tensor) -> Tensor:
+    """How far along a side of its face each point lies, 0 to 1 inside, [rays, faces]."""
+    return (point * across).sum(dim=2) / (side * across).sum(dim=1)
+
+
+def save_room(
+    room: Room, folder: str | os.PathLike[str], views: int = 24, width: int = 160, height: int = 120, seed: int = 0
+) -> None:
+    """Write a room.
+
+    | file | holds |
+    |---|---|
+    | transforms.json, images/{stem}.png | cameras on a round through the room, and what they see, rendered |
+    | labels/{stem}.png, classes.json | ids, class k is k + 1 and 0 nothing; names |
+    | depth/{stem}.png | uint16 [mm] |
+    | scene.ply | the Gaussians, with their class in the column `label` |
+
+    Args:
+        room: What to write.
+        folder: Created if needed.
+        views, width, height: Number and size of the photographs [pixels].
+        seed: Of the cameras.
+    """
+    folder = Path(folder)
+    cameras = room_cameras(room, seed, views, width, height)
+    for number, camera in enumerate(cameras):
+        classes, depth = room_truth(room, camera)
+        name = f"{number:04d}.png"
+        write_rgb(folder / "images" / name, rasterize(room.gaussians, camera).features.clamp(0, 1))
+        write_ids(folder / "labels" / name, (classes + 1).numpy().astype(np.uint8))
+        write_ids(folder / "depth" / name, (1000 * depth).round().clamp(max=65535).numpy().astype(np.uint16))
+    named = replace(room.gaussians, extras={LABEL: room.classes.numpy().astype(np.int32)})
+    save_gaussians(named, folder / "scene.ply")
+    _write_text(folder / "transforms.json", json.dumps(transforms_of(cameras)))
+    _write_text(folder / "classes.json", json.dumps({str(k + 1): name for k, name in enumerate(CLASSES)}))
+
+
+def transforms_of(cameras: Sequence[Camera]) -> dict[str, object]:
+    """The content of a transforms.json, images named images/{number:04d}.png."""
+    flip = torch.diag(torch.tensor([1.0, -1.0, -1.0, 1.0], dtype=torch.float64))
+    K = cameras[0].K
+    frames = [
+        {
+            "file_path": f"images/{number:04d}.png",
+            "transform_matrix": (torch.linalg.inv(camera.world_to_camera) @ flip).tolist(),
+        }
+        for number, camera in enumerate(cameras)
+    ]
+    names = {"fl_x": K[0, 0], "fl_y": K[1, 1], "cx": K[0, 2], "cy": K[1, 2]}
+    lens = {name: float(value) for name, value in names.items()}
+    return {"w": cameras[0].width, "h": cameras[0].height, **lens, "frames": frames}
+
+
+def _write_text(path: Path, text: str) -> None:
+    with atomic_path(path) as temporary:
+        temporary.write_text(text, encoding="utf-8")

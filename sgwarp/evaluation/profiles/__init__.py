@@ -1,0 +1,1 @@
+"""Published protocols, one module each; `catalogue` names them."""
