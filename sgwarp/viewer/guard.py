@@ -222,3 +222,8 @@ def guard_messages(server: Any) -> None:
 def is_waiting(client: Any) -> bool:
     """Whether a client has not been sent yet what was queued for it: it takes its pictures slowly."""
     return bool(client._websock_connection.get_message_buffer().message_from_id)
+
+
+def let_go_quietly(client: Any) -> None:
+    """Have what is sent to a client that has just gone be dropped without a warning: a tab was closed, that is all."""
+    client._websock_connection.get_message_buffer()._warned_push_after_done = True

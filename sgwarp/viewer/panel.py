@@ -54,6 +54,7 @@ class Panel:
         self._client, self.tab, self._changed = client, tab, changed
         self._splats, self._aim = splats, aim
         self._typing: threading.Timer | None = None
+        self._closed = False
         self._filling = False  # a control is set by the program, not by the user
         with client.gui.add_folder("Ask"):
             self._build_ask()
@@ -64,6 +65,12 @@ class Panel:
         with client.gui.add_folder("Save", expand_by_default=False):
             self._build_save()
         self._status = client.gui.add_markdown("")
+
+    def close(self) -> None:
+        """Do nothing more: the tab is gone."""
+        self._closed = True
+        if self._typing is not None:
+            self._typing.cancel()
 
     # What the user is told
 
@@ -80,6 +87,8 @@ class Panel:
 
     def _try(self, work: Callable[[], Any], redraw: bool = True) -> Any:
         """Do what a control asks for; a value that is refused changes nothing, whatever fails is told."""
+        if self._closed:
+            return None
         try:
             result = work()
         except InputError as error:

@@ -19,7 +19,7 @@ from sgwarp.errors import InputError
 from sgwarp.rendering.orbits import orbit_views
 from sgwarp.scene import View
 from sgwarp.viewer import bounds
-from sgwarp.viewer.guard import LOOPBACK, Gate, gated, guard_messages
+from sgwarp.viewer.guard import LOOPBACK, Gate, gated, guard_messages, let_go_quietly
 from sgwarp.viewer.panel import Panel
 from sgwarp.viewer.screen import Canvas
 from sgwarp.viewer.streaming import Stream, Streamer
@@ -137,7 +137,7 @@ class Viewer:
         with self._lock:
             session = self._sessions.pop(client.client_id, None)
         if session is not None:
-            self.streamer.remove(session.stream)
+            session.close()
 
     def _changed(self) -> None:
         self.streamer.change()
@@ -180,6 +180,7 @@ class Session:
         self.canvas = Canvas(client, lambda message: self.panel.tell(message, wrong=True))
         self.stream = Stream(self.canvas, self.tab.shot)
         self.panel = Panel(client, self.tab, self.changed, self.draw_splats, self.aim)
+        let_go_quietly(client)
         viewer.streamer.add(self.stream)
         self._listen()
         self.moved()
@@ -198,6 +199,11 @@ class Session:
         @scene.on_rect_select(modifier="shift")
         def _(event: Any) -> None:
             self.panel.rectangle(event.screen_min, event.screen_max)
+
+    def close(self) -> None:
+        """The tab is gone."""
+        self.panel.close()
+        self.viewer.streamer.remove(self.stream)
 
     def moved(self) -> None:
         """Take the camera of the page; one that is out of bounds is left out."""
