@@ -21,6 +21,7 @@ from sgwarp.commands.render import Render
 from sgwarp.commands.report import Report
 from sgwarp.commands.segment import Segment
 from sgwarp.commands.track import Track
+from sgwarp.commands.view import View
 
 COMMANDS = {
     "poses": Poses,
@@ -33,6 +34,7 @@ COMMANDS = {
     "track": Track,
     "instances": Instances,
     "edit": Edit,
+    "view": View,
     "render": Render,
     "batch": Batch,
     "info": Info,

@@ -14,7 +14,7 @@ from sgwarp.encoders.prompts import CANONICAL
 from sgwarp.errors import InputError
 from sgwarp.evaluation.cases import Case
 from sgwarp.querying.ensembles import score_together, seen_by
-from sgwarp.querying.scores import TEMPERATURES, class_votes, confidence, relevancy
+from sgwarp.querying.scores import class_votes, relevancy
 from sgwarp.querying.segmentation import segment_votes, splat_scores
 from sgwarp.rendering.renderer import render
 from sgwarp.scene import FeatureMap, Semantics, View
@@ -98,7 +98,7 @@ class Answers:
             place = torch.tensor([*(classes.index(n) if n in classes else -1 for n in found.labels), -1])
             return _resized(place[found.ids[0].long()], view)
         cosines = self._cosines(found, list(classes))[0]
-        best = confidence(cosines, TEMPERATURES["cosine"]).argmax(dim=2)
+        best = cosines.argmax(dim=2)
         return _resized(torch.where(cosines.isfinite().all(dim=2), best, -1), view)
 
     def _relevancy_of_map(self, source: object, view: View, texts: Sequence[str]) -> Tensor:

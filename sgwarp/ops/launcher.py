@@ -14,8 +14,9 @@ import sys
 import threading
 import weakref
 from collections import deque
-from collections.abc import Sequence
+from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
+from contextlib import contextmanager
 from typing import Any
 
 import numpy as np
@@ -114,6 +115,29 @@ def _executor() -> ThreadPoolExecutor:
         return _pool
 
 
+class Interrupted(Exception):
+    """What a block of `interruptible` was doing is no longer wanted."""
+
+
+@contextmanager
+def interruptible(unwanted: Callable[[], bool]) -> Iterator[None]:
+    """Launches of this thread in the block stop soon after `unwanted()` is true, and raise Interrupted.
+
+    It is asked before each launch, and on the CPU before each chunk of one, by several threads. What the launch has
+    written so far is worth nothing.
+    """
+    before = getattr(_local, "unwanted", None)
+    _local.unwanted = unwanted
+    try:
+        yield
+    finally:
+        _local.unwanted = before
+
+
+def _never() -> bool:
+    return False
+
+
 def launch(
     kernel: wp.Kernel,
     count: int,
@@ -131,9 +155,15 @@ def launch(
         count: Number of kernel threads.
         slots: Pass the number of the host thread, which names its scratch; less than `get_threads()`.
         chunk: Kernel threads per host launch, by default an eighth of a host thread's share.
+
+    Raises:
+        Interrupted: In a block of `interruptible`.
     """
     if count == 0:
         return
+    unwanted: Callable[[], bool] = getattr(_local, "unwanted", None) or _never
+    if unwanted():
+        raise Interrupted
     head = [0, 0] if slots else [0]
     if device.type == "cuda":
         stream = current_stream(device)
@@ -148,7 +178,7 @@ def launch(
 
     def work(slot: int) -> None:
         command = None
-        while (base := next(ticket) * size) < count:
+        while (base := next(ticket) * size) < count and not unwanted():
             if command is None:
                 first = [base, slot] if slots else [base]
                 command = wp.launch(kernel, size, [*first, *inputs], outputs, device="cpu", record_cmd=True)
@@ -163,6 +193,8 @@ def launch(
     finally:
         for helper in helpers:
             helper.result()
+    if unwanted():  # some chunk may have been left out
+        raise Interrupted
 
 
 def launch_blocks(

@@ -90,6 +90,23 @@ class Isolate:
 
 
 @dataclass(frozen=True)
+class Fade:
+    """Multiply the selection's opacities by a factor; 0 hides it."""
+
+    name: ClassVar[str] = "fade"
+    factor: float = 0.0
+
+    def __post_init__(self) -> None:
+        _number("fade", "factor", self.factor)
+        if not 0.0 <= self.factor <= 1.0:
+            raise InputError(f"fade: factor is a number from 0 to 1, got {self.factor}")
+
+    def apply(self, gaussians: Gaussians, chosen: Tensor) -> Change:
+        opacities = torch.where(chosen, gaussians.opacities * self.factor, gaussians.opacities)
+        return Change(replace(gaussians, opacities=opacities))
+
+
+@dataclass(frozen=True)
 class Move:
     """Shift the selection [m]."""
 
@@ -198,9 +215,9 @@ class Duplicate:
         return Change(Move(self.by).apply(gaussians.subset(rows), new).gaussians, rows, len(copied))
 
 
-Operation = Remove | Extract | Isolate | Move | Rotate | Scale | Recolor | Duplicate
+Operation = Remove | Extract | Isolate | Fade | Move | Rotate | Scale | Recolor | Duplicate
 OPERATIONS: dict[str, Any] = {
-    kind.name: kind for kind in (Remove, Extract, Isolate, Move, Rotate, Scale, Recolor, Duplicate)
+    kind.name: kind for kind in (Remove, Extract, Isolate, Fade, Move, Rotate, Scale, Recolor, Duplicate)
 }
 
 

@@ -16,7 +16,7 @@ from sgwarp.errors import InputError
 from sgwarp.ops.splatting.contributors import top_contributors
 from sgwarp.querying.scores import class_votes
 from sgwarp.querying.scoring import score_texts
-from sgwarp.scene import Gaussians, InstanceMap, Semantics, View
+from sgwarp.scene import Camera, Gaussians, InstanceMap, Semantics, View
 
 NEIGHBORS = 8  # of a Gaussian when pieces are told apart
 LINK = 4.0  # neighbors farther apart than this many median distances belong to different pieces
@@ -109,6 +109,8 @@ def _pick_term(state: EditState, term: Term, selection: Selection, context: Edit
         corners = torch.tensor(term.numbers, dtype=torch.float64, device=gaussians.device)
         means = gaussians.means.double()
         return ((means >= corners[:3]) & (means <= corners[3:])).all(dim=1)
+    if term.kind == "rows":
+        return _pick_rows(state, term)
     if term.kind == "click":
         return _pick_click(state, term, context)
     if term.kind == "id":
@@ -177,19 +179,56 @@ def _pick_click(state: EditState, term: Term, context: EditContext) -> Tensor:
     if not (0 <= x < view.camera.width and 0 <= y < view.camera.height):
         size = f"{view.camera.width} x {view.camera.height}"
         raise InputError(f"select click:{term.text},{x},{y}: outside the image, which is {size}")
-    found, weights = (part[y, x] for part in top_contributors(state.gaussians, view.camera, CLICK_DEPTH))
-    found, weights = found[found >= 0].long(), weights[found >= 0]
+    if context.instances is None and context.semantics is None:
+        raise InputError(f"select click:{term.text},{x},{y}: needs --instances, or --semantics for what looks alike")
+    return pick_at(state, context, view.camera, (x, y))
+
+
+def pick_at(
+    state: EditState, context: EditContext, camera: Camera, pixel: tuple[int, int], level: str | None = None
+) -> Tensor:
+    """The instance at a pixel, or where no instances are known what looks alike around it, bool [N]; maybe none.
+
+    Args:
+        state: The scene.
+        context: Its instances or semantics.
+        camera: The view.
+        pixel: x and y, inside the image.
+        level: Of the instances; the coarsest if None.
+
+    Raises:
+        InputError: The context has neither instances nor semantics, or there is no such level.
+    """
+    found, weights = contributors_at(state.gaussians, camera, pixel)
+    nothing = torch.zeros_like(state.copies, dtype=torch.bool)
     if not len(found):
-        return torch.zeros_like(state.copies, dtype=torch.bool)
+        return nothing
     if context.instances is not None:
-        ids = context.instances.instance().to(state.rows.device)[state.rows]
+        ids = context.instances.instance(level).to(state.rows.device)[state.rows]
         votes = torch.bincount(ids[found].clamp(min=0), weights=weights.double())
         votes[0] = 0.0
         same_copy = state.copies == state.copies[found[0]]
         return (ids == votes.argmax()) & (votes.max() > 0) & same_copy
     if context.semantics is None:
-        raise InputError(f"select click:{term.text},{x},{y}: needs --instances, or --semantics for what looks alike")
+        raise InputError("a click needs instances, or semantics for what looks alike")
     return _looks_alike(state, context.semantics, found, weights)
+
+
+def contributors_at(gaussians: Gaussians, camera: Camera, pixel: tuple[int, int]) -> tuple[Tensor, Tensor]:
+    """The strongest contributors of a pixel (x, y), int64 [k], and their weights, float32 [k]; k is at most 8."""
+    x, y = pixel
+    found, weights = (part[y, x] for part in top_contributors(gaussians, camera, CLICK_DEPTH))
+    return found[found >= 0].long(), weights[found >= 0]
+
+
+def _pick_rows(state: EditState, term: Term) -> Tensor:
+    count = len(state.gaussians)
+    chosen = torch.zeros(count, dtype=torch.bool)
+    for first, last in zip(term.numbers[::2], term.numbers[1::2], strict=True):
+        if last >= count:
+            raise InputError(f"select rows:{int(first)}-{int(last)}: the scene has rows 0 to {count - 1} at this step")
+        chosen[int(first) : int(last) + 1] = True
+    return chosen.to(state.gaussians.device)
 
 
 def _looks_alike(state: EditState, semantics: Semantics, clicked: Tensor, weights: Tensor) -> Tensor:

@@ -8,6 +8,7 @@ A selection is a list of terms, each a short text:
 | id:3 | an instance |
 | box:x0,y0,z0,x1,y1,z1 | centers inside a box [m] |
 | click:STEM,x,y | the instance, or what looks alike around it, at a pixel of a view |
+| rows:0-4,9 | Gaussians by their place in the scene as it is at that step, ends included |
 | copy:1 | what the first duplication added |
 | last | what the step before was applied to, or the copy it made |
 | all | everything |
@@ -16,13 +17,14 @@ A selection is a list of terms, each a short text:
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, fields
 from typing import Any
 
 from sgwarp.errors import InputError
 
-KINDS = ("text", "id", "box", "click", "copy")
+MOST_DIGITS = 12  # of a row number
+KINDS = ("text", "id", "box", "click", "copy", "rows")
 
 
 @dataclass(frozen=True)
@@ -94,6 +96,8 @@ def parse_term(term: str) -> Term:
         if number < 1 or number != int(number):
             raise InputError(f"select '{term}': expected a whole number from 1 on")
         return Term(kind, numbers=(number,))
+    if kind == "rows":
+        return Term(kind, numbers=_ranges(rest))
     if kind == "box":
         corners = _numbers(term, rest, 6, "box:x0,y0,z0,x1,y1,z1")
         if any(low > high for low, high in zip(corners[:3], corners[3:], strict=True)):
@@ -101,6 +105,33 @@ def parse_term(term: str) -> Term:
         return Term(kind, numbers=corners)
     stem, _, pixel = rest.partition(",")
     return Term(kind, stem, _numbers(term, pixel, 2, "click:STEM,x,y"))
+
+
+def rows_term(rows: Sequence[int]) -> str:
+    """The term that selects these rows, which ascend; runs of them are written as ranges."""
+    parts: list[str] = []
+    start = last = None
+    for row in [*rows, None]:
+        if last is not None and row == last + 1:
+            last = row
+            continue
+        if start is not None:
+            parts.append(str(start) if start == last else f"{start}-{last}")
+        start = last = row
+    return "rows:" + ",".join(parts)
+
+
+def _ranges(text: str) -> tuple[float, ...]:
+    """First and last row of each range, one after the other."""
+    numbers: list[float] = []
+    for part in text.split(","):
+        first, dash, last = part.partition("-")
+        if not (first.isdecimal() and (last.isdecimal() if dash else True)) or len(part) > 2 * MOST_DIGITS + 1:
+            raise InputError(f"select 'rows:': write ranges such as rows:0-4,9; got '{part[:40]}'")
+        numbers += [int(first), int(last) if dash else int(first)]
+        if numbers[-1] < numbers[-2]:
+            raise InputError(f"select 'rows:': the range '{part}' ends before it begins")
+    return tuple(numbers)
 
 
 def _numbers(term: str, text: str, count: int, form: str) -> tuple[float, ...]:

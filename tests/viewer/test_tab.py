@@ -1,0 +1,507 @@
+"""A tab against geometry: what it shows, finds, selects, changes and saves."""
+
+import importlib.util
+import itertools
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+
+from sgwarp.apps.editing import operations as ops
+from sgwarp.apps.editing.script import load_script
+from sgwarp.apps.editing.session import edit
+from sgwarp.errors import InputError
+from sgwarp.io.scenes import load_gaussians
+from sgwarp.querying.scoring import score_texts
+from sgwarp.rendering.renderer import render
+from sgwarp.viewer import downloads
+from sgwarp.viewer.modes import draw
+from sgwarp.viewer.tab import Tab
+from sgwarp.viewer.workbench import Materials, Workbench
+from sgwarp.visualization.pictures import class_colours, to_picture
+
+spec = importlib.util.spec_from_file_location("viewer_conftest", Path(__file__).with_name("conftest.py"))
+helpers = importlib.util.module_from_spec(spec)
+spec.loader.exec_module(helpers)
+place_of = helpers.place_of
+
+LAMP, BOOK, DOOR = (0.55, -0.45, 3.2), (0.7, 0.65, 2.7), (-0.75, -0.5, 3.0)
+
+
+def pixels(tab: Tab):
+    return draw(tab.shot(), tab.camera).pixels.astype(int)
+
+
+def interior(labels: torch.Tensor, label: int) -> np.ndarray:
+    """Pixels whose neighborhood all has the label."""
+    same = (labels == label).float()[None, None]
+    return (-torch.nn.functional.max_pool2d(-same, 5, stride=1, padding=2))[0, 0].bool().numpy()
+
+
+# Pictures
+
+
+def test_color_is_the_rendering(tab, stage):
+    assert np.array_equal(pixels(tab), to_picture(render(stage.gaussians, tab.camera)))
+    tab.set_background((255, 0, 0))
+    void = (stage.labels(stage.views[2]) == 0).numpy()
+    assert void.any()
+    assert pixels(tab)[void][:, 0].mean() > 200
+
+
+def test_depth_and_opacity(tab, stage):
+    tab.set_mode("opacity")
+    labels = stage.labels(stage.views[2])
+    opacity = pixels(tab)
+    assert opacity[interior(labels, 0)].max() == 0
+    assert opacity[interior(labels, 3)].min() > 240
+    tab.set_mode("depth")
+    near, far = (pixels(tab)[interior(labels, label)].mean(axis=0) for label in (4, 1))
+    assert near[0] > near[2]  # near is red
+    assert far[2] > far[0]  # far is blue
+
+
+def test_depth_for_the_browser_is_that_of_the_panels(tab, stage):
+    from dataclasses import replace
+
+    drawn = draw(replace(tab.shot(), depth=True), tab.camera)
+    truth = stage.depth(stage.views[2])
+    lamp = interior(stage.labels(stage.views[2]), 3)
+    np.testing.assert_allclose(drawn.depth[lamp], truth.numpy()[lamp], rtol=2e-3)
+
+
+def test_segmentation_paints_the_true_panels(tab, stage):
+    plain = pixels(tab)
+    tab.ask("left door; lamp; book")
+    tab.set_mode("segmentation")
+    shown, labels = pixels(tab), stage.labels(stage.views[2])
+    for query, label in enumerate((2, 3, 4)):
+        inside = interior(labels, label)
+        wanted = 0.4 * plain[inside] + 0.6 * class_colours(3)[query]
+        assert (np.abs(shown[inside] - wanted).max(axis=1) <= 1).mean() > 0.95
+    wall = shown[interior(labels, 1)]
+    assert (wall == wall[:, :1]).all(), "fits none of them: gray"
+    assert [name for name, _ in tab.legend()] == ["left door", "lamp", "book"]
+
+
+def test_labels_are_segmented_without_a_question(stage, label_semantics):
+    tab = Tab(Workbench(Materials(stage.gaussians, label_semantics, views=stage.views)))
+    tab.camera = stage.views[2].camera
+    tab.set_mode("segmentation")
+    lamp = pixels(tab)[interior(stage.labels(stage.views[2]), 3)]
+    own = class_colours(4)[2].astype(int)
+    assert np.abs(lamp - own).sum(axis=1).max() < 250
+    assert len(tab.legend()) == 4
+
+
+def test_relevancy_is_hot_on_what_is_asked(tab, stage):
+    plain, labels = pixels(tab), stage.labels(stage.views[2])
+    tab.ask("lamp")
+    assert tab.look.mode == "relevancy"
+    shown, wall = pixels(tab), interior(labels, 1)
+    lamp = shown[interior(labels, 3)].mean(axis=0)
+    assert lamp[0] > lamp[2] + 60
+    wanted = 0.75 * plain[wall] + 0.25 * np.array([48, 18, 59])  # the cold end of turbo
+    assert np.abs(shown[wall] - wanted).mean() < 8
+
+
+def test_two_queries_have_their_colors_and_the_rest_is_dim(tab, stage):
+    before = pixels(tab)
+    tab.ask("lamp; book")
+    shown, labels = pixels(tab), stage.labels(stage.views[2])
+    lamp, book = (shown[interior(labels, label)].mean(axis=0) for label in (3, 4))
+    first, second = class_colours(2).astype(int)
+    assert np.abs(lamp - first).sum() < np.abs(lamp - second).sum()
+    assert np.abs(book - second).sum() < np.abs(book - first).sum()
+    wall = interior(labels, 1)
+    assert shown[wall].mean() < 0.4 * before[wall].mean()
+
+
+def test_features_of_one_panel_have_one_color(tab, stage):
+    tab.set_strength(1.0)
+    tab.set_mode("features")
+    shown, labels = pixels(tab), stage.labels(stage.views[2])
+    means = []
+    for label in (1, 2, 3, 4):
+        inside = shown[interior(labels, label)]
+        assert inside.std(axis=0).max() < 25
+        means.append(inside.mean(axis=0))
+    apart = [np.abs(a - b).max() for k, a in enumerate(means) for b in means[:k]]
+    assert min(apart) > 60
+
+
+def test_instances_have_the_colors_of_their_ids(tab, stage):
+    tab.set_strength(1.0)
+    tab.set_mode("instances")
+    lamp = pixels(tab)[interior(stage.labels(stage.views[2]), 3)]
+    assert np.abs(lamp.mean(axis=0) - class_colours(8)[6]).max() < 12
+    tab.set_level("s")
+    wall = interior(stage.labels(stage.views[2]), 1)
+    assert np.array_equal(pixels(tab)[wall], to_picture(render(stage.gaussians, tab.camera))[wall]), "has no parts"
+
+
+def test_coverage_marks_what_no_view_saw(stage):
+    from sgwarp.viewer.paints import coverage_colors
+
+    paint = coverage_colors(stage.gaussians, None, stage.views[:1])
+    camera = stage.views[0].camera
+    at = stage.gaussians.means.double() @ camera.world_to_camera[:3, :3].T + camera.world_to_camera[:3, 3]
+    image = at @ camera.K.T
+    x, y = image[:, 0] / image[:, 2], image[:, 1] / image[:, 2]
+    outside = (x < 0) | (x > camera.width) | (y < 0) | (y > camera.height)
+    magenta = (paint == torch.tensor([1.0, 0.0, 1.0])).all(dim=1)
+    assert bool(outside.any())
+    assert torch.equal(magenta, outside)
+
+
+@pytest.mark.parametrize("mode", ["features", "relevancy", "segmentation", "instances", "coverage"])
+def test_a_mode_without_its_material_is_refused(stage, mode):
+    tab = Tab(Workbench(Materials(stage.gaussians)))
+    with pytest.raises(InputError, match="needs"):
+        tab.set_mode(mode)
+    assert tab.look.mode == "color"
+
+
+# Questions
+
+
+def test_scores_are_those_of_the_one_path(tab, toy_semantics, toy_text):
+    answers = tab.ask(" lamp ;book; lamp ;")
+    assert answers.questions.queries == ("lamp", "book")
+    expected = score_texts(toy_semantics, ["lamp", "book"], toy_text)
+    assert torch.equal(answers.scores.values, expected.values)
+    with_rivals = tab.ask("lamp", "wall; book")
+    rivals = score_texts(toy_semantics, ["lamp"], toy_text, measure="relevancy", canonical=("wall", "book"))
+    assert torch.equal(with_rivals.scores.values, rivals.values)
+
+
+def test_histogram_counts_every_seen_gaussian(tab, toy_semantics):
+    centers, counts = tab.ask("lamp").histogram()
+    assert len(centers) == len(counts) == 40
+    assert float(counts.sum()) == int(toy_semantics.seen.sum())
+
+
+def test_ranked_instances_begin_with_the_one_named(tab):
+    ranked = tab.ask("lamp").rank(tab.bench.materials.instances)
+    assert (ranked[0].id, ranked[0].name) == (7, "lamp")
+    assert ranked[0].score > ranked[1].score + 0.5
+    assert ranked[-1].name in ("wall", "left door", "object 8")
+
+
+def test_an_empty_box_forgets(tab):
+    tab.ask("lamp")
+    assert tab.ask("  ;; ") is None
+    assert (tab.answers, tab.look.mode) == (None, "color")
+
+
+def test_templates_make_their_own_encoder(stage, toy_semantics, toy_text):
+    asked = []
+
+    def make(templates):
+        asked.append(templates)
+        return toy_text
+
+    tab = Tab(Workbench(Materials(stage.gaussians, toy_semantics, None, toy_text, make)))
+    tab.ask("lamp", templates="photo")
+    tab.ask("book", templates="photo")
+    tab.ask("book", templates="own")
+    assert asked == ["photo"]
+    with pytest.raises(InputError, match="template"):
+        tab.ask("lamp", templates="a picture")
+
+
+class Seeing:
+    """The toy text space with an image tower: the reddest pictures are lamps."""
+
+    space, side = "toy", 8
+
+    def __init__(self, text):
+        self.encode_text = text.encode_text
+
+    def encode_images(self, crops):
+        assert crops.shape[1:] == (8, 8, 3)
+        red = crops.float().mean(dim=(1, 2))[:, 0] > 127
+        return torch.stack([torch.eye(5)[2 if bool(one) else 3] for one in red])
+
+
+def test_a_picture_is_asked_for(stage, toy_semantics, toy_text):
+    import cv2
+
+    tab = Tab(Workbench(Materials(stage.gaussians, toy_semantics, None, Seeing(toy_text))))
+    red = np.zeros((20, 30, 3), np.uint8)
+    red[..., 2] = 255  # cv2 writes blue, green, red
+    name = tab.add_picture(cv2.imencode(".png", red)[1].tobytes())
+    answers = tab.ask(f"book; {name}")
+    assert torch.equal(answers.scores.values[:, 1], tab.ask("lamp").scores.values[:, 0])
+    with pytest.raises(InputError, match="picture"):
+        tab.add_picture(b"no picture")
+
+
+def test_without_an_image_tower_pictures_are_refused(tab):
+    with pytest.raises(InputError, match="image tower"):
+        tab.add_picture(b"")
+
+
+def test_ensemble_with_the_network(stage, toy_semantics, toy_text):
+    from dataclasses import replace
+
+    predicted = replace(toy_semantics, features=toy_semantics.features.roll(1, dims=1))  # it calls lamps books
+    tab = Tab(Workbench(Materials(stage.gaussians, toy_semantics, predicted, toy_text)))
+    lifted, network = (tab.ask("lamp", ensemble=one).scores.values[:, 0] for one in ("2d", "3d"))
+    lamp = (stage.classes == 3) & toy_semantics.seen
+    assert float(lifted[lamp].median()) > 0.8
+    assert float(network[lamp].median()) < 0.2
+
+
+# Clicks
+
+
+def test_a_click_finds_the_object_then_its_part_then_the_object(tab, stage):
+    place = place_of(tab.camera, LAMP)
+    whole = tab.click((place[0], place[1] - 0.05))
+    assert (whole.instance, whole.level, whole.words[0]) == (7, "m", ("lamp", 0.8))
+    assert torch.equal(whole.selected, stage.classes == 3)
+    assert whole.confidence == pytest.approx(11 / 12)
+    part = tab.click((place[0], place[1] - 0.05))
+    assert (part.instance, part.level) == (3, "s")
+    assert int(part.selected.sum()) < int(whole.selected.sum())
+    assert bool((stage.classes[part.selected] == 3).all())
+    assert tab.click((place[0], place[1] - 0.05)).instance == 7
+    assert tab.click(place_of(tab.camera, DOOR)).instance == 6, "another object is whole again"
+
+
+def test_an_object_without_a_label_is_named_by_the_semantics(tab):
+    found = tab.click(place_of(tab.camera, BOOK))
+    assert found.instance == 8
+    assert found.words[0][0] == "book"
+    assert "book" in found.sentence
+    assert "object 8" in found.sentence
+
+
+def test_without_instances_a_click_takes_what_looks_alike(stage, toy_semantics, toy_text):
+    tab = Tab(Workbench(Materials(stage.gaussians, toy_semantics, None, toy_text)))
+    tab.camera = stage.views[2].camera
+    found = tab.click(place_of(tab.camera, LAMP))
+    assert bool((stage.classes[found.selected] == 3).all())
+    assert int(found.selected.sum()) > 0.8 * int((stage.classes == 3).sum())
+    bare = Tab(Workbench(Materials(stage.gaussians)))
+    bare.camera = tab.camera
+    with pytest.raises(InputError, match="--instances or --semantics"):
+        bare.click((0.5, 0.5))
+
+
+def test_a_click_into_the_void_selects_nothing(tab, stage):
+    void = (stage.labels(stage.views[2]) == 0).nonzero()[0]
+    assert not bool(tab.click((float(void[1]) / 96, float(void[0]) / 72)).selected.any())
+
+
+def test_a_rectangle_takes_what_is_visible_and_with_through_what_is_behind(tab, stage):
+    (x, y), half = place_of(tab.camera, BOOK), 0.04
+    found = tab.select_rectangle((x + half, y + half), (x - half, y - half))
+    assert set(stage.classes[found.selected].tolist()) == {4}
+    tab.set_through(True)
+    behind = tab.select_rectangle((x - half, y - half), (x + half, y + half))
+    assert set(stage.classes[behind.selected].tolist()) == {1, 4}
+    assert bool((found.selected & ~behind.selected).sum() == 0)
+
+
+def test_what_was_found_is_selected(tab, stage):
+    tab.ask("book; lamp")
+    found = tab.select_found(1)
+    assert set(stage.classes[found.selected].tolist()) == {3}
+
+
+def test_the_selection_is_outlined(tab, stage):
+    before = pixels(tab)
+    tab.click(place_of(tab.camera, LAMP))
+    after, labels = pixels(tab), stage.labels(stage.views[2])
+    lamp, wall = interior(labels, 3), interior(labels, 1)
+    assert np.array_equal(before[wall & interior(labels, 1)], after[wall & interior(labels, 1)])
+    assert np.abs(after[lamp] - before[lamp]).max() > 20
+
+
+# Edits
+
+
+def test_delete_undo_and_redo(tab, stage):
+    before = pixels(tab)
+    tab.click(place_of(tab.camera, LAMP))
+    tab.edit(ops.Remove())
+    assert tab.found is None
+    assert len(tab.shot().gaussians) == int((stage.classes != 3).sum())
+    assert np.abs(pixels(tab) - before).max() > 100
+    tab.bench.undo()
+    assert np.array_equal(pixels(tab), before)
+    tab.bench.redo()
+    assert len(tab.shot().gaussians) == int((stage.classes != 3).sum())
+    with pytest.raises(InputError, match="redo"):
+        tab.bench.redo()
+
+
+def test_what_is_moved_stays_selected_and_answers_follow(tab, stage):
+    tab.ask("lamp; wall")
+    tab.click(place_of(tab.camera, LAMP))
+    tab.edit(ops.Move((0.0, 0.3, 0.0)))
+    assert torch.equal(tab.found.selected, stage.classes == 3)
+    tab.edit(ops.Remove())
+    assert set(stage.classes[tab.shot().scores.seen.nonzero().flatten()].tolist()) >= {1}
+    assert len(tab.shot().scores.values) == len(tab.shot().gaussians)
+
+
+def test_hide_isolate_and_recolor_keep_the_rows(tab, stage):
+    for operation in (ops.Fade(0.0), ops.Isolate(0.05), ops.Recolor((1.0, 0.0, 0.0))):
+        tab.click(place_of(tab.camera, BOOK))
+        tab.edit(operation)
+        tab.clear_selection()
+        tab.bench.undo()
+    tab.click(place_of(tab.camera, BOOK))
+    tab.edit(ops.Fade(0.0))
+    gone = tab.shot().gaussians.opacities == 0
+    assert torch.equal(gone, stage.classes == 4)
+
+
+def test_an_edit_of_one_tab_shows_in_another(tab, bench, stage):
+    other, calls = Tab(bench), []
+    other.camera = tab.camera
+    end = bench.subscribe(lambda: calls.append(1))
+    other.click(place_of(tab.camera, DOOR))
+    tab.click(place_of(tab.camera, LAMP))
+    tab.edit(ops.Remove())
+    assert calls == [1]
+    assert len(other.shot().gaussians) == len(tab.shot().gaussians)
+    assert other.shot().selected is None
+    with pytest.raises(InputError, match="earlier state"):
+        other.edit(ops.Remove())
+    end()
+    bench.undo()
+    assert calls == [1]
+
+
+def test_saved_scene_and_script_agree(tab, stage, tmp_path):
+    tab.click(place_of(tab.camera, LAMP))
+    tab.edit(ops.Duplicate((0.5, 0.0, 0.0)))
+    place = place_of(tab.camera, BOOK)
+    tab.select_rectangle((place[0] - 0.03, place[1] - 0.03), (place[0] + 0.03, place[1] + 0.03))
+    tab.edit(ops.Remove())
+    scene, script = tmp_path / "s.ply", tmp_path / "e.json"
+    scene.write_bytes(downloads.scene_file(tab.bench, plain=True))
+    script.write_bytes(downloads.script_file(tab.bench))
+    steps = load_script(script, stage.gaussians)
+    assert [step.operation.name for step in steps] == ["duplicate", "remove"]
+    assert steps[0].selection.select == ("id:7",)
+    assert steps[1].selection.select[0].startswith("rows:")
+    replayed = edit(stage.gaussians, steps, tab.bench.session.context).gaussians
+    saved = load_gaussians(scene)
+    torch.testing.assert_close(saved.means, replayed.means)
+    torch.testing.assert_close(saved.opacities, replayed.opacities, rtol=1e-4, atol=1e-5)
+
+
+def test_saving_keeps_columns_unless_plain(stage, tmp_path):
+    from dataclasses import replace
+
+    label = stage.classes.numpy().astype(np.int32)
+    bench = Workbench(Materials(replace(stage.gaussians, extras={"label": label})))
+    bench.apply("rows:0-9", ops.Remove())
+    path = tmp_path / "s.ply"
+    path.write_bytes(downloads.scene_file(bench, plain=False))
+    assert np.array_equal(load_gaussians(path).extras["label"], label[10:])
+    path.write_bytes(downloads.scene_file(bench, plain=True))
+    assert not load_gaussians(path).extras
+    path.write_bytes(downloads.scene_file(bench, plain=True, only=torch.arange(len(label) - 10) < 7))
+    assert len(load_gaussians(path)) == 7
+
+
+def test_saved_picture_is_the_picture(tab):
+    import cv2
+
+    data = np.frombuffer(downloads.picture_file(tab.shot(), tab.camera), np.uint8)
+    assert np.array_equal(cv2.imdecode(data, cv2.IMREAD_COLOR)[..., ::-1], draw(tab.shot(), tab.camera).pixels)
+
+
+def test_a_path_becomes_a_video(tab, stage, tmp_path):
+    import cv2
+
+    with pytest.raises(InputError, match="two places"):
+        downloads.video_file(tab.shot(), tab.keys)
+    for view in stage.views[:2]:
+        tab.camera = view.camera
+        tab.add_key()
+    path, told = tmp_path / "path.mp4", []
+    path.write_bytes(downloads.video_file(tab.shot(), tab.keys, lambda done, total: told.append((done, total))))
+    video = cv2.VideoCapture(str(path))
+    assert int(video.get(cv2.CAP_PROP_FRAME_COUNT)) == told[-1][1] == 37
+    first = video.read()[1][..., ::-1].astype(int)
+    wanted = draw(tab.shot(), stage.views[0].camera).pixels[: first.shape[0], : first.shape[1]]
+    assert np.abs(first - wanted).mean() < 12
+
+
+def test_a_flight_passes_its_keys_and_turns_evenly(stage):
+    from dataclasses import replace
+
+    keys = [view.camera for view in stage.views[:3]]
+    flight = downloads.fly(keys, 10)
+    assert len(flight) == 21
+    for at, key in zip((0, 10, 20), keys, strict=True):
+        torch.testing.assert_close(flight[at].world_to_camera, key.world_to_camera, rtol=0, atol=1e-9)
+    angles = []
+    for one, other in itertools.pairwise(flight[:11]):
+        turn = one.world_to_camera[:3, :3] @ other.world_to_camera[:3, :3].T
+        angles.append(float(torch.arccos(((turn.trace() - 1) / 2).clamp(-1, 1))))
+    assert max(angles) < min(angles) + 1e-6
+    straight = [replace(keys[0], world_to_camera=_shifted(keys[0], x)) for x in (0.0, 1.0, 2.0)]
+    places = torch.stack([camera.position for camera in downloads.fly(straight, 4)])
+    steps = places.diff(dim=0)
+    torch.testing.assert_close(steps, steps[:1].expand_as(steps), rtol=0, atol=1e-9)
+
+
+def _shifted(camera, x):
+    pose = camera.world_to_camera.clone()
+    pose[0, 3] -= x
+    return pose
+
+
+# Moving scenes
+
+
+def test_frames_of_a_moving_scene(stage, tmp_path):
+    from dataclasses import replace
+
+    from sgwarp.io.sequence_files import write_params
+    from sgwarp.io.sequences import load_sequence
+
+    moved = [replace(stage.gaussians, means=stage.gaussians.means + torch.tensor([0.2 * t, 0, 0])) for t in range(3)]
+    write_params(tmp_path / "params.npz", moved)
+    sequence = load_sequence(tmp_path / "params.npz")
+    tab = Tab(Workbench(Materials(sequence.frame(0).gaussians, sequence=sequence)))
+    tab.camera = stage.views[2].camera
+    first = pixels(tab)
+    tab.set_moment(2)
+    torch.testing.assert_close(tab.shot().gaussians.means, moved[2].means)
+    assert not np.array_equal(pixels(tab), first)
+    with pytest.raises(InputError, match="time"):
+        tab.set_moment(3)
+    tab.select_rectangle((0.4, 0.4), (0.6, 0.6))
+    with pytest.raises(InputError, match="moving scene"):
+        tab.edit(ops.Remove())
+
+
+# A scene that grows
+
+
+def test_a_growing_scene_replaces_the_old_one(stage):
+    bench = Workbench(Materials(stage.gaussians))
+    tab, calls = Tab(bench), []
+    bench.subscribe(lambda: calls.append(len(tab.shot().gaussians)))
+    bench.replace_scene(stage.gaussians.subset(torch.arange(50)))
+    assert calls == [50]
+    assert not bench.session.steps
+
+
+def test_semantics_that_grow_can_be_asked(stage, toy_semantics, toy_text):
+    bench = Workbench(Materials(stage.gaussians, None, None, toy_text))
+    tab = Tab(bench)
+    with pytest.raises(InputError, match="--semantics"):
+        tab.ask("lamp")
+    bench.replace_semantics(toy_semantics)
+    assert set(stage.classes[tab.ask("lamp").scores.values[:, 0] > 0.5].tolist()) == {3}
