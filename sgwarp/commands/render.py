@@ -64,7 +64,7 @@ class Render(SceneOptions):
             views = self._views(gaussians)
             if folder != self.out and len(views) > 1:
                 raise InputError(f"--out {self.out}: is one file for {len(views)} views; name a folder, or one --view")
-            background = gaussians.means.new_ones(3) if self.mode == "rgb" and self.background == "white" else None
+            background = gaussians.means.new_ones(3) if self.background == "white" else None
             with show_progress("render") as progress:
                 progress(0, len(views), "")
                 for done, view in enumerate(views, start=1):

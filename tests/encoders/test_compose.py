@@ -7,6 +7,7 @@ from torch.nn.functional import interpolate, normalize
 
 from sgwarp.encoders.base import Instances, MapSource, Masks, TextEncoder, require_same_space
 from sgwarp.encoders.compose import Crops, MaskedImages, PaintedInstances, PlainPixels, RefinedPixels, box_masks
+from sgwarp.encoders.regions import cut_squares
 from sgwarp.errors import InputError
 
 HEIGHT, WIDTH = 48, 64
@@ -64,6 +65,22 @@ def at(found, y, x):
     """Vector at a pixel of an id map, None where there is none."""
     number = int(found.ids[0, y, x])
     return None if number < 0 else found.vectors[number]
+
+
+def test_crops_reach_a_little_beyond_their_mask(image):
+    seen = []
+
+    class Sized(Toy):
+        def encode_images(self, crops):
+            seen.append(crops)
+            return super().encode_images(crops)
+
+    masks = torch.zeros(1, HEIGHT // 2, WIDTH // 2, dtype=torch.bool)
+    masks[0, 8:12, 10:18] = True
+    Crops(Sized()).encode_regions(image, masks)
+    square = np.array([[28 - 9.6, 20 - 9.6, 19.2]])  # x, y, side: 1.2 x 16 pixels around the middle of the mask
+    expected = cut_squares((image * 255).round().byte().numpy(), square, Toy.side)
+    assert torch.equal(seen[0], torch.from_numpy(expected))
 
 
 def test_image_level(view, image):

@@ -277,6 +277,12 @@ def test_names_for_other_proposals():
     assert make_encoder("conse").generator == make_encoder("conse:regions").generator == Proposals("graph")
 
 
+def test_what_the_modes_look_at():
+    """Crops alone are Crops of the encoder; by default regions of one pass over the whole image as well."""
+    assert isinstance(make_encoder("conse:crops").encoder, Crops)
+    assert isinstance(make_encoder("conse").encoder, Conse)
+
+
 def test_spaces_without_texts():
     with pytest.raises(InputError, match="space 'labels' holds lifted ids"):
         text_encoder_for("labels")

@@ -265,7 +265,7 @@ def test_closed_sets(kind, tools, tmp_path, view, image):
     assert found.size == (16, 16)  # 48 x 64 becomes 64 x 64, read at a quarter
     assert found.ids.min() >= 0
     strict = ClosedSet(str(tmp_path), least=0.999, longest=64).encode(view, image)
-    assert (strict.ids == -1).all() or (strict.ids == -1).sum() > (found.ids == -1).sum()
+    assert (strict.ids == -1).all()  # random weights are sure of nothing
     with pytest.raises(InputError, match="needs an image"):
         source.encode(view, None)
 

@@ -245,6 +245,22 @@ def test_the_loss_weighs_voxels_by_their_reliability(stage, by_reliability):
     assert by_reliability == (abs(float(expected) - float((1 - cosine).mean())) > 1e-4)
 
 
+def test_rates_and_decay_reach_the_optimizer(scenes, monkeypatch):
+    taken = []
+    step = torch.optim.AdamW.step
+
+    def watched(optimizer, *arguments):
+        taken.extend((group["lr"], group["weight_decay"]) for group in optimizer.param_groups)
+        return step(optimizer, *arguments)
+
+    monkeypatch.setattr(torch.optim.AdamW, "step", watched)
+    settings = replace(SETTINGS, epochs=4, learning_rate=0.01, weight_decay=0.03)
+    distill(scenes[:1], settings)
+    cosine = [0.01 * (1 + math.cos(math.pi * epoch / 4)) / 2 for epoch in range(4)]
+    assert [rate for rate, _ in taken] == pytest.approx(cosine)
+    assert {decay for _, decay in taken} == {0.03}
+
+
 @pytest.mark.parametrize("field", ["space", "features", "labels"])
 def test_scenes_of_another_kind_are_refused(field, scenes, stage):
     g, semantics = scenes[1].load()

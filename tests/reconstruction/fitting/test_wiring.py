@@ -13,11 +13,13 @@ from sgwarp.reconstruction.fitting import loop, trainer
 from sgwarp.reconstruction.fitting.checkpoint import fingerprint
 from sgwarp.reconstruction.fitting.densify import FAINT, Densify
 from sgwarp.reconstruction.fitting.exposure import Exposure
+from sgwarp.reconstruction.fitting.frame import Frame
 from sgwarp.reconstruction.fitting.mcmc import MarkovChain
 from sgwarp.reconstruction.fitting.model import Gradients, Model
 from sgwarp.reconstruction.fitting.photographs import read_photographs
 from sgwarp.reconstruction.fitting.settings import FitSettings
 from sgwarp.reconstruction.fitting.trainer import fit
+from sgwarp.runs.log import RunLog
 from sgwarp.scene import Camera, Gaussians
 
 CAMERA = Camera(torch.tensor([[40.0, 0, 20], [0, 40, 20], [0, 0, 1]]), torch.eye(4), 40, 40)
@@ -302,6 +304,32 @@ def test_measured_before_the_refinement(boards, spied):
         *(("measure", 8), ("after_step", 8)),
         *(("after_step", 12), ("measure", 12)),  # the last measurement is of what is returned
     ]
+
+
+def test_near_and_far_reach_the_rasterizer(boards, spied):
+    views = [replace(view, camera=replace(view.camera, near=0.002, far=50.0)) for view in boards.views]
+    fit(views[1:], load_points(boards.folder), (), replace(SHORT, steps=2))
+    cameras = [Frame.around(views[1:]).camera(view.camera) for view in views[1:]]
+    reached = [(options["near"], options["far"]) for name, _, options in spied if name == "rasterize_with_gradients"]
+    assert reached == [(cameras[0].near, cameras[0].far)] * 2
+    assert cameras[0].near < 0.005
+
+
+def test_the_degree_of_the_colors_stays_below_its_limit():
+    settings = FitSettings(sh_degree=2, degree_every=3)
+    assert [settings.degree_at(step) for step in (0, 2, 3, 6, 9, 100)] == [0, 0, 1, 2, 2, 2]
+
+
+@pytest.mark.parametrize("background", ["black", "white"])
+def test_the_background_of_what_is_measured(boards, spied, background):
+    """Transparent where nothing is: Gaussians behind the cameras show nothing at all."""
+    blank = Gaussians(*(torch.full((4, *shape), 0.1) for shape in ((3,), (4,), (3,), (), (1, 3))))
+    run = loop.Loop(replace(SHORT, background=background), read_photographs(boards.views[:2]), [], 1.0, CPU, RunLog())
+    run.begin(replace(blank, means=blank.means - 50.0))
+    run.measure_fitted()
+    shown = [args[0] for name, args, _ in spied if name == "psnr"]
+    assert len(shown) == 2
+    assert all(torch.equal(image, torch.full_like(image, float(background == "white"))) for image in shown)
 
 
 def test_exposures_follow_the_share_of_the_run(boards, spied):
