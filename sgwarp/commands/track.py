@@ -162,7 +162,8 @@ class Track(Options):
         """What two runs must have in common for the second to go on from the first."""
         names = ("encoder", "split", "classes", "text", "forgetting", "patience", "change", "foreground", "scoring")
         chosen = {name: getattr(self, name) for name in (*names, "temperature", "unknown_below", "photographs")}
-        return {**chosen, "scene": str(self.scene.resolve()), "views": str(self.views.resolve())}
+        masks = None if self.mask_views is None else [str(self.mask_views.resolve()), self.mask_split]
+        return {**chosen, "mask_views": masks, "scene": str(self.scene.resolve()), "views": str(self.views.resolve())}
 
     def _summarize(self, tracks: dict[str, Any], log: RunLog) -> None:
         known = [value for value in tracks["switches"] if value is not None]

@@ -9,7 +9,7 @@ import torch
 
 from sgwarp.apps.editing import operations as ops
 from sgwarp.apps.editing.measurement import measure_edit
-from sgwarp.apps.editing.picker import EditContext, grow, largest_pieces, pick
+from sgwarp.apps.editing.picker import EditContext, _name_instances, grow, largest_pieces, pick
 from sgwarp.apps.editing.script import EditStep, load_script, save_script, step_from
 from sgwarp.apps.editing.selection import Selection, parse_term
 from sgwarp.apps.editing.session import HISTORY, EditSession, edit
@@ -18,7 +18,7 @@ from sgwarp.ops.planar.harmonics_rotation import rotate_harmonics, rotation_of_h
 from sgwarp.ops.reference.rasterizer import harmonics, rotation_matrices
 from sgwarp.ops.splatting.settings import RasterSettings
 from sgwarp.rendering.renderer import render
-from sgwarp.scene import Camera, Instance, InstanceMap, Semantics
+from sgwarp.scene import Camera, Gaussians, Instance, InstanceMap, Semantics, View
 
 FIELDS = ("means", "quats", "scales", "opacities", "sh")
 QUAT = torch.tensor([0.7, -0.3, 0.5, 0.4], dtype=torch.float64)
@@ -81,6 +81,20 @@ def test_the_rotated_scene_from_the_rotated_camera_is_the_original_picture(scene
     assert float(before.std()) > 0.1
     plain = render(dataclasses.replace(turned, sh=gaussians.sh), moved, settings=settings)
     assert degree == 0 or float((before - plain).abs().max()) > 1e-2, "without turning the harmonics it shows"
+
+
+def test_at_the_default_cutoffs_only_a_crossed_threshold_shows(scenes):
+    """Rounding moves an alpha over 1/255 in few pixels, and such a Gaussian adds no more than that."""
+    gaussians, camera = scenes.cloud(300, seed=2, degree=3), scenes.pinhole()
+    center = torch.tensor([0.3, -0.2, 4.0], dtype=torch.float64)
+    turned = ops.rotate_gaussians(gaussians, torch.ones(300, dtype=torch.bool), QUAT, center)
+    turn = rotation_matrices(QUAT[None])[0]
+    back = torch.eye(4, dtype=torch.float64)
+    back[:3, :3], back[:3, 3] = turn.T, center - turn.T @ center
+    moved = Camera(camera.K, camera.world_to_camera @ back, camera.width, camera.height)
+    error = (render(gaussians, camera) - render(turned, moved)).abs()
+    assert float(error.max()) < 2 / 255
+    assert float((error > 1e-5).float().mean()) < 2e-3
 
 
 # Operations
@@ -227,6 +241,16 @@ def test_texts_name_gaussians_and_whole_instances(stage, context):
     assert torch.equal(both, stage.classes >= 3)
 
 
+def test_a_text_names_all_instances_that_come_close_to_the_best(stage, context):
+    """Means of 3, 2.5, 1 and -1: those from 80 % of the best on are named, and none that a rival fits better."""
+    scores = torch.tensor([3.0, 2.5, 1.0, -1.0])[stage.classes - 1]
+    seen, nothing = torch.ones(len(scores), dtype=torch.bool), torch.full_like(scores, -torch.inf)
+    assert torch.equal(_name_instances(scores, nothing, seen, context.instances), stage.classes <= 2)
+    rivals = torch.where(stage.classes == 1, 4.0, 0.0)
+    assert torch.equal(_name_instances(scores, rivals, seen, context.instances), stage.classes == 2)
+    assert not bool(_name_instances(-scores.abs(), nothing, seen, context.instances).any())
+
+
 def test_without_semantics_a_text_is_a_label(stage, context):
     labels = dataclasses.replace(context, semantics=None, encoder=None)
     assert torch.equal(picked(stage, labels, "lamp"), stage.classes == 3)
@@ -255,6 +279,39 @@ def test_a_click_selects_what_is_in_front(stage, context):
         assert torch.equal(picked(stage, context, f"click:{view.stem},{x},{y}"), stage.classes == number)
         alike = dataclasses.replace(context, instances=None)
         assert torch.equal(picked(stage, alike, f"click:{view.stem},{x},{y}"), stage.classes == number)
+
+
+def test_a_click_weighs_what_a_pixel_shows():
+    """One Gaussian of instance 1 hides three of instance 2 behind it."""
+    means = torch.tensor([[0.0, 0.0, 3.0], [0.0, 0.0, 4.0], [0.0, 0.0, 4.1], [0.0, 0.0, 4.2]])
+    quats = torch.tensor([1.0, 0.0, 0.0, 0.0]).expand(4, 4)
+    gaussians = Gaussians(means, quats, torch.full((4, 3), 0.3), torch.full((4,), 0.9), torch.zeros(4, 1, 3))
+    zero = (0.0, 0.0, 0.0)
+    table = tuple(Instance(k, "default", 0, 1, 1, 1, 1.0, zero, (1.0, 0.0, 0.0, 0.0), zero) for k in (1, 2))
+    ids = torch.tensor([1, 2, 2, 2], dtype=torch.int32)[None, :, None]
+    counts = torch.full((4,), 9.0)
+    found = InstanceMap(ids, torch.ones(1, 4, 1), counts, table, ("default",), gaussians.fingerprint)
+    K = torch.tensor([[50.0, 0.0, 16.0], [0.0, 50.0, 16.0], [0.0, 0.0, 1.0]])
+    view = View("a", Camera(K, torch.eye(4, dtype=torch.float64), 32, 32))
+    session = EditSession(gaussians, EditContext(instances=found, views=(view,)))
+    assert session.preview(Selection(("click:a,16,16",), clean=False)).tolist() == [True, False, False, False]
+
+
+def test_a_click_on_a_copy_selects_the_copy(stage, context):
+    """The lamp's copy stands in front of the wall, where the first view shows nothing else."""
+    session = EditSession(stage.gaussians, context)
+    session.apply(EditStep(Selection(("lamp",)), ops.Duplicate((0.0, 0.0, -0.8))))
+    view = stage.views[0]
+    shown = render(session.state.gaussians, view.camera, "features", features=session.state.selected.float()[:, None])
+    y, x = (shown[..., 0] > 0.9).nonzero().float().mean(0).long().tolist()
+    assert torch.equal(session.preview(Selection((f"click:{view.stem},{x},{y}",))), session.state.copies == 1)
+
+
+def test_what_is_kept_stays_out_of_what_is_grown(stage, context):
+    grown = picked(stage, context, "lamp", keep=("wall",), grow=1.0)
+    wide = picked(stage, context, "lamp", grow=1.0)
+    assert bool((wide & (stage.classes == 1)).any())
+    assert torch.equal(grown, wide & (stage.classes != 1))
 
 
 def test_growing_and_shrinking_are_distances(stage, context):

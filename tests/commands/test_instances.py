@@ -8,7 +8,11 @@ import pytest
 import torch
 from plyfile import PlyData
 
+from sgwarp.apps.editing import operations as ops
+from sgwarp.apps.editing.script import EditStep
+from sgwarp.apps.editing.selection import Selection
 from sgwarp.cli import main
+from sgwarp.errors import InputError
 from sgwarp.files.images import read_ids
 from sgwarp.io.instances import load_instances, save_instances
 from sgwarp.io.scenes import load_gaussians, save_gaussians
@@ -135,8 +139,6 @@ def test_instances_refuses_bad_input(stage_files, found, tmp_path, capsys):
 
 
 def test_damaged_instances_files(stage_files, found, tmp_path):
-    from sgwarp.errors import InputError
-
     instances = load_instances(found)
     with pytest.raises(InputError, match="belong to scene"):
         load_instances(found, stage_files.gaussians.subset(torch.arange(9)))
@@ -237,3 +239,91 @@ def test_edit_refuses_bad_input(stage_files, found, edit, tmp_path, capsys):
     assert "was made for scene" in fails(capsys, *edit, "--script", other)
     other.unlink()
     assert not list(tmp_path.iterdir())
+
+
+# Every option reaches what does the work
+
+
+@pytest.fixture
+def stopped(monkeypatch, capsys):
+    """`stopped(target, *arguments)` runs a command up to the call of `target`; its arguments and keywords."""
+
+    def called(target: str, *arguments):
+        seen = []
+
+        def stop(*positional, **keywords):
+            seen.append((positional, keywords))
+            raise InputError("stopped here")
+
+        with monkeypatch.context() as patch:
+            patch.setattr(target, stop)
+            assert "stopped here" in fails(capsys, *arguments)
+        return seen[0]
+
+    return called
+
+
+INSTANCE_OPTIONS = {
+    "group": ("name", "grouping"),
+    "levels": ("s, l", "levels"),
+    "least_iou": (0.5, "least_iou"),
+    "least_gaussians": (25, "least_gaussians"),
+    "least_confidence": (0.75, "least_confidence"),
+    "neighbors": (3, "neighbors"),
+    "least_cosine": (0.25, "least_cosine"),
+}
+
+
+@pytest.mark.parametrize("name", INSTANCE_OPTIONS)
+def test_instance_options_change_what_they_name_alone(stage, stage_files, stopped, tmp_path, name):
+    save_semantics(lift(stage_files.gaussians, stage.views, stage.dense), tmp_path / "s.safetensors")
+    parts = ["instances", stage_files.scene, "--views", stage_files.views, "--masks", f"files:{stage_files.labels}"]
+    parts += ["--out", tmp_path / "i.safetensors", "--semantics", tmp_path / "s.safetensors"]
+    value, field = INSTANCE_OPTIONS[name]
+    target = "sgwarp.apps.instances.finder.find"
+    (positional, keywords), (changed, _) = (
+        stopped(target, *parts, *more) for more in ([], [f"--{name.replace('_', '-')}", value])
+    )
+    assert [view.stem for view in positional[1]] == [view.stem for view in stage.views]
+    assert keywords["semantics"].space == "toy"
+    wanted = tuple(value.split(", ")) if name == "levels" else value
+    assert getattr(positional[3], field) != wanted
+    assert replace(positional[3], **{field: wanted}) == changed[3]
+
+
+def test_edit_options_become_steps(stage, stage_files, found, stopped, edit):
+    """A selection with all it was given, and operations in the order in which they make sense."""
+    target = "sgwarp.apps.editing.session.edit"
+    (_, (plain,), context), _ = stopped(target, *edit, "--select", "id:1", "--remove")
+    assert plain == EditStep(Selection(("id:1",)), ops.Remove())
+    assert len(context.instances.table) == 4
+    assert (context.semantics, context.views) == (None, ())
+    more = ["--keep", "id:2", "box:0,0,0,1,1,1", "--negatives", "wall", "--threshold", 0.25, "--grow", -0.5]
+    given = ["--move", 1, 2, 3, "--recolor", "#ff0000", "--rotate", 0, 1, 0, 30, "--scale", 2, "--isolate", 0.25]
+    given += ["--duplicate", 4, 5, 6, "--extract", "--views", stage_files.views]
+    (_, steps, context), _ = stopped(target, *edit, "--select", "id:1", "lamp", *more, "--no-clean", *given)
+    first = Selection(("id:1", "lamp"), ("id:2", "box:0,0,0,1,1,1"), ("wall",), 0.25, -0.5, clean=False)
+    assert [step.selection for step in steps] == [first, *[Selection(("last",), clean=False)] * 6]
+    assert [step.operation for step in steps] == [
+        ops.Duplicate((4, 5, 6)),
+        ops.Scale(2),
+        ops.Rotate((0, 1, 0), 30),
+        ops.Recolor((1, 0, 0)),
+        ops.Move((1, 2, 3)),
+        ops.Isolate(0.25),
+        ops.Extract(),
+    ]
+    assert [view.stem for view in context.views] == [view.stem for view in stage.views]
+
+
+def test_edit_asks_the_encoder_of_its_semantics(stage, stage_files, stopped, toy_text, edit, tmp_path, monkeypatch):
+    asked = []
+    monkeypatch.setattr("sgwarp.encoders.registry.text_encoder_for", lambda *names: asked.append(names) or toy_text)
+    path = tmp_path / "s.safetensors"
+    save_semantics(lift(stage_files.gaussians, stage.views, stage.dense), path, {"encoder": "clip:somewhere"})
+    for more in ([], ["--encoder", "other"]):
+        (_, _, context), _ = stopped(
+            *("sgwarp.apps.editing.session.edit", *edit, "--select", "lamp", "--remove", "--semantics", path, *more)
+        )
+        assert context.encoder is toy_text
+    assert asked == [("toy", "clip:somewhere", "cpu"), ("toy", "other", "cpu")]

@@ -2,6 +2,7 @@
 
 import json
 import shutil
+from functools import partial
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -117,7 +118,7 @@ def test_stored_features_are_those_of_the_frame(files, tracked):
 @pytest.mark.parametrize("after", [1, 4])
 def test_a_killed_run_goes_on_to_the_same_bytes(files, tracked, tmp_path, monkeypatch, after):
     out, write = tmp_path / "out", tracking_run._write
-    monkeypatch.setattr(tracking_run.Output, "every", 2)
+    monkeypatch.setattr(tracking_run, "Output", partial(tracking_run.Output, every=2))
 
     def dies(output, one, *rest):
         if one.index == after:
@@ -130,12 +131,42 @@ def test_a_killed_run_goes_on_to_the_same_bytes(files, tracked, tmp_path, monkey
     assert not (out / "tracks.json").exists()
     monkeypatch.setattr(tracking_run, "_write", write)
     assert main(arguments(files, out, "--features", "--resume")) == 0
-    assert written(out) == written(tracked)
+    first = after // 2 * 2  # behind the last checkpoint
+    run = json.loads((out / "run.json").read_text())
+    assert run["left_out"].get("frames_done_before", 0) == first
+    mine, whole = written(out), written(tracked)
+    rows = [json.loads(found.pop(f"{first:05d}/frame.json")) for found in (mine, whole)]
+    tracks = [json.loads(found.pop("tracks.json")) for found in (mine, whole)]
+    # What is kept of the views is not stored: the first frame is lifted in full.
+    assert (rows[0].pop("left_out"), tracks[0]["left_out"].pop(first)) == (0.0, 0.0)
+    rows[1].pop("left_out"), tracks[1]["left_out"].pop(first)
+    assert (rows[0], tracks[0]) == (rows[1], tracks[1])
+    assert mine == whole
 
 
 def test_resume_needs_the_same_options(files, tracked, capsys):
     assert main(arguments(files, tracked, "--features", "--resume", "--forgetting", "0.5")) == 2
     assert "had forgetting 0.9, now 0.5" in capsys.readouterr().err
+    assert main(arguments(files, tracked, "--features", "--resume", "--mask-views", str(files))) == 2
+    assert "had mask_views None, now [" in capsys.readouterr().err
+
+
+CARRIED = ("forgetting", "patience", "change", "foreground", "scoring", "temperature", "unknown_below", "photographs")
+
+
+def test_resume_compares_whatever_changes_the_answer(stopped):
+    """Of the options, and of scene, views and encoder; not of those that change only what is drawn or how fast."""
+    plain = stopped().output.settings
+    for name in (*CARRIED, "split"):
+        value = OPTIONS[name][0]
+        option = f"--{name.replace('_', '-')}"
+        given = [option, value] if not isinstance(value, bool) else [option if value else f"--no-{option[2:]}"]
+        settings = stopped(*given).output.settings
+        assert [key for key in plain if plain[key] != settings[key]] == [name]
+    asked = stopped("--classes", "1", "--text", "x", "--encoder", f"files:{plain['views']}/truth").output.settings
+    assert {key for key in plain if plain[key] != asked[key]} == {"classes", "text", "encoder"}
+    for option in ("--no-incremental", "--features", "--no-pictures"):
+        assert stopped(option).output.settings == plain
 
 
 def test_incremental_or_not_is_the_same(files, tracked, tmp_path):

@@ -341,6 +341,23 @@ def test_forgetting_by_hand():
     assert found.features.tolist() == [[0.0, 3.0], [3.0, 0.0]]
 
 
+def test_in_a_text_space_a_contradiction_is_four_times_the_usual_distance():
+    """Two of three turn by 0.2 rad, 1 - cos = 0.02; the third by 0.3 (0.045) agrees, by 0.5 (0.12) it does not."""
+
+    def turned(*angles):
+        return sums_of([[math.cos(angle), math.sin(angle)] for angle in angles], [1.0] * len(angles))
+
+    for angle, agrees in ((0.3, True), (0.5, False)):
+        fusion = Fusion(FusionSettings(0.5), labels=False)
+        fusion.update(turned(0.0, 0.0, 0.0), None)
+        found = fusion.update(turned(0.2, 0.2, angle), None)
+        assert found.weight.tolist() == [1.5, 1.5, 1.5 if agrees else 1.0]
+        assert found.against.tolist() == [0.0, 0.0, 0.0 if agrees else 1.0]
+    labels = Fusion(FusionSettings(0.5), labels=True)
+    labels.update(turned(0.0, 0.0, 0.0), None)
+    assert labels.update(turned(0.2, 0.2, 0.5), None).weight.tolist() == [1.5] * 3
+
+
 def test_settings_of_fusion():
     for wrong in ({"forgetting": 1.1}, {"forgetting": -0.1}, {"patience": 0}, {"change": 0.0}):
         with pytest.raises(InputError, match=next(iter(wrong))):
