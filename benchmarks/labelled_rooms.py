@@ -136,11 +136,15 @@ def vote(
     return torch.where(votes.sum(dim=1) > 0, votes.argmax(dim=1), -1)
 
 
-def generated_room(seed: int = 1, count: int = 30_000, views: int = 40) -> LabelledRoom:
-    """A room of the generator."""
+def generated_room(cache: Path, seed: int = 1, count: int = 30_000, views: int = 40) -> LabelledRoom:
+    """A room of the generator; `cache` keeps its label images, as rays take minutes."""
     room = make_room(seed, count)
     cameras = room_cameras(room, seed, views)
     named = [View(f"{number:04d}", camera) for number, camera in enumerate(cameras)]
-    truth = {view.stem: room_truth(room, view.camera)[0].long() for view in named}
+    path = cache / f"generated-{seed}-{count}-{views}.npz"
+    if not path.is_file():
+        cache.mkdir(parents=True, exist_ok=True)
+        np.savez(path, **{view.stem: room_truth(room, view.camera)[0].numpy() for view in named})
+    truth = {stem: torch.from_numpy(image).long() for stem, image in np.load(path).items()}
     lifted = [view for k, view in enumerate(named) if k % HOLD_OUT]
     return LabelledRoom("generated", room.gaussians, lifted, named[::HOLD_OUT], truth, CLASSES, room.classes)

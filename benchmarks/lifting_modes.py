@@ -2,14 +2,15 @@
 
     SGWARP_DATA=FOLDER python -m benchmarks.lifting_modes [choose] [sweep] [rivals] [encoder] [plot] [--out FILE.json]
 
-What is lifted are true labels, corrupted as `labelled_rooms` states. choose: settings of the modes on the generated room.
-sweep: every mode with them on both rooms, at 100, 50, 20 and 10 % of the views and of the Gaussians. rivals: nearest
-points, and features fitted by gradient descent, measured along the way. encoder: the default encoder's maps in place of
-labels, on the rendered room. plot: accuracy against seconds. Parts not asked for keep their figures in the file.
+What is lifted are true labels, corrupted as `labelled_rooms` states. choose: settings of the modes on the generated
+room. sweep: every mode with them on both rooms, at 100, 50, 20 and 10 % of the views and of the Gaussians. rivals:
+nearest points, and features fitted by gradient descent, measured along the way. time: the seconds of the rows with all
+views again, for a machine that was busy. encoder: the default encoder's maps in place of labels, on the rendered room.
+plot: accuracy against seconds. Parts not asked for keep their figures in the file.
 
 Per row: share of the Gaussians with the true class (an unseen one has none), mIoU on held-out views, share of the
-pixels there whose rendered label is not the true one (`residual`), coverage, seconds without making the maps, bytes of the
-features and of all arrays of their size that are held at once.
+pixels there whose rendered label is not the true one (`residual`), coverage, seconds without making the maps, bytes of
+the features and of all arrays of their size that are held at once.
 """
 
 from __future__ import annotations
@@ -17,6 +18,7 @@ from __future__ import annotations
 import argparse
 import json
 import os
+import tempfile
 import time
 from collections.abc import Callable
 from pathlib import Path
@@ -40,11 +42,12 @@ Row = dict[str, Any]
 SHARES = (1.0, 0.5, 0.2, 0.1)
 ARRAYS = {"weighted": 1, "center": 1, "squared": 1, "strongest": 1, "robust": 4, "solve": 2, "reliable": 2}
 FITTED_ARRAYS = 4  # features, gradient, and both moments of Adam
-LOOK_AT = (10, 30, 100, 300, 1000)
+FITS = {"fitted": None, "fitted, 8 channels": 8}
+LOOK_AT = (10, 30, 100, 300)
 CHOICES: dict[str, list[dict[str, Any]]] = {
-    "center": [{"tau": tau, "border": border} for tau in (0.02, 0.05, 0.1, 0.25) for border in (0, 10)],
-    "robust": [{"passes": p, "smoothing": s} for p in (1, 2, 4, 8) for s in (1e-3, 1e-1)],
-    "solve": [{"ridge": ridge, "iterations": count} for ridge in (1.0, 10.0, 100.0) for count in (4, 8)],
+    "center": [{"tau": tau, "border": border} for tau in (0.02, 0.05, 0.25) for border in (0, 10)],
+    "robust": [{"passes": p, "smoothing": s} for p, s in ((2, 1e-3), (4, 1e-3), (8, 1e-3), (4, 1e-1))],
+    "solve": [{"ridge": r, "iterations": n} for r, n in ((1.0, 4), (10.0, 4), (100.0, 4), (10.0, 8))],
 }
 
 
@@ -114,8 +117,12 @@ def sweep(rooms: dict[str, LabelledRoom], results: Row, save: Callable[[Row], No
             save(rows)
 
 
+def share_name(share: float) -> str:
+    return f"{share:.0%} of views"
+
+
 def _parts(room: LabelledRoom) -> dict[str, LabelledRoom]:
-    views = {f"{share:.0%} of views": room.with_views(share) for share in SHARES}
+    views = {share_name(share): room.with_views(share) for share in SHARES}
     return views | {f"{share:.0%} of Gaussians": room.with_gaussians(share) for share in SHARES[1:]}
 
 
@@ -131,7 +138,7 @@ def rivals(rooms: dict[str, LabelledRoom], results: Row, save: Callable[[Row], N
         start = time.perf_counter()
         semantics = fuse_nearest_points(room.gaussians, room.views, maps)
         rows[f"{name}, nearest points"] = measure(room, semantics, time.perf_counter() - start, 2)
-        for what, channels in (("fitted", None), ("fitted, 8 channels", 8)):
+        for what, channels in FITS.items():
 
             def look(at: Snapshot, what: str = what, name: str = name, room: LabelledRoom = room) -> None:
                 weight = at.features.abs().amax(dim=1).sign()
@@ -143,6 +150,32 @@ def rivals(rooms: dict[str, LabelledRoom], results: Row, save: Callable[[Row], N
                 room.gaussians, room.views, maps, steps=LOOK_AT[-1], channels=channels, look=look, look_at=LOOK_AT
             )
             save(rows)
+
+
+def measure_time(rooms: dict[str, LabelledRoom], results: Row, save: Callable[[Row], None]) -> None:
+    """Seconds of the modes with all views and Gaussians, and of a step of each fit, put into the other parts' rows."""
+    for name, room in rooms.items():
+        maps = {view.stem: room.noisy(view) for view in room.views}
+        few = {view.stem: maps[view.stem] for view in room.views[:2]}
+        for method, (mode, settings, _) in tuned(results).items():
+            sg.lift(room.gaussians, room.views[:2], few, mode, lift_settings=settings)  # compiles
+            log = RunLog()
+            start = time.perf_counter()
+            sg.lift(room.gaussians, room.views, maps, mode, lift_settings=settings, log=log)
+            seconds = time.perf_counter() - start - log.stages.get("residual", 0.0)
+            results["sweep"][f"{name}, {share_name(1.0)}, {method}"]["seconds"] = seconds
+        start = time.perf_counter()
+        fuse_nearest_points(room.gaussians, room.views, maps)
+        results["rivals"][f"{name}, nearest points"]["seconds"] = time.perf_counter() - start
+        for what, channels in FITS.items():
+            seen: list[Snapshot] = []
+            fit_features(
+                *(room.gaussians, room.views, maps), steps=60, channels=channels, look=seen.append, look_at=(10, 60)
+            )
+            per_step = (seen[1].seconds - seen[0].seconds) / 50
+            for step in LOOK_AT:
+                results["rivals"][f"{name}, {what}, {step} steps"]["seconds"] = step * per_step
+    save({"seconds": "of the rows with all views, and of a step of each fit"})
 
 
 def encoder(rooms: dict[str, LabelledRoom], results: Row, save: Callable[[Row], None]) -> None:
@@ -207,13 +240,8 @@ def plot(results: Row, path: Path) -> None:
                 _mark(panel, row, key.removeprefix(start), "o")
         _mark(panel, results["rivals"][f"{room}, nearest points"], "nearest points", "s")
         for what, color in (("fitted", "tab:red"), ("fitted, 8 channels", "tab:orange")):
-            steps = [
-                (int(k.split(", ")[-1].split()[0]), r)
-                for k, r in results["rivals"].items()
-                if k.startswith(f"{room}, {what}, ") and k.removeprefix(f"{room}, {what}, ")[0].isdigit()
-            ]
-            steps.sort(key=lambda pair: pair[0])
-            panel.plot([r["seconds"] for _, r in steps], [r["mIoU"] for _, r in steps], "^-", color=color, label=what)
+            rows = [results["rivals"][f"{room}, {what}, {step} steps"] for step in LOOK_AT]
+            panel.plot([r["seconds"] for r in rows], [r["mIoU"] for r in rows], "^-", color=color, label=what)
         alone = results["rivals"][f"{room}, 2D alone"]["mIoU"]
         panel.axhline(alone, color="grey", linestyle=":", label="2D maps alone")
         panel.set(title=f"{room} room", xscale="log", xlabel="seconds (without the maps)")
@@ -231,11 +259,12 @@ def _mark(panel: Any, row: Row, name: str, marker: str) -> None:
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parts = {"choose": choose, "sweep": sweep, "rivals": rivals, "encoder": encoder}
+    parts = {"choose": choose, "sweep": sweep, "rivals": rivals, "time": measure_time, "encoder": encoder}
     parser.add_argument("parts", nargs="*", choices=[*parts, "plot", []], help="all if none is named")
     parser.add_argument("--out", type=Path, default=Path(__file__).with_name("lifting_modes.json"))
     parser.add_argument("--picture", type=Path, default=Path("docs/images/lifting_modes.png"))
     parser.add_argument("--count", type=int, default=40_000, help="Gaussians of the rendered room")
+    parser.add_argument("--cache", type=Path, default=Path(tempfile.gettempdir()) / "sgwarp-benchmark-rooms")
     options = parser.parse_args()
     data = os.environ.get("SGWARP_DATA")
     if data is None:
@@ -248,7 +277,10 @@ def main() -> None:
         options.out.write_text(json.dumps(results, indent=1) + "\n")
 
     if set(asked) & set(parts):
-        rooms = {"generated": generated_room(), "rendered": rendered_room(Path(data) / "room", options.count)}
+        rooms = {
+            "generated": generated_room(options.cache),
+            "rendered": rendered_room(Path(data) / "room", options.count),
+        }
         for part in parts:
             if part in asked:
                 parts[part](rooms, results, lambda found, part=part: save(part, found))  # type: ignore[misc]
