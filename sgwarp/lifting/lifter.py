@@ -11,12 +11,14 @@ from torch import Tensor
 
 from sgwarp.errors import InputError
 from sgwarp.lifting.holes import fill_holes
-from sgwarp.lifting.map_reader import MapReader, Maps, as_source, has_map
+from sgwarp.lifting.map_reader import MapReader, as_source, has_map
+from sgwarp.lifting.map_reader import Maps as Maps
 from sgwarp.lifting.reliability import view_reliabilities
 from sgwarp.lifting.residuals import residual
 from sgwarp.lifting.ridge import Problem, choose_ridge
 from sgwarp.lifting.robust import geometric_median
-from sgwarp.lifting.settings import LiftMode, LiftSettings, check_mode
+from sgwarp.lifting.settings import LiftMode as LiftMode
+from sgwarp.lifting.settings import LiftSettings, check_mode
 from sgwarp.ops.launcher import get_threads, set_threads
 from sgwarp.ops.splatting.lifting import LiftSums, lift_view
 from sgwarp.ops.splatting.settings import RasterSettings

@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import torch
 from torch import Tensor
@@ -25,7 +25,7 @@ from sgwarp.scene import FeatureMap, View
 BLOCK = 64  # channels solved together
 RIDGES = (1.0, 10.0, 100.0)  # that are tried
 HOLD_OUT = 6  # every so many-th view is held out to choose the ridge
-CHANNELS_TO_CHOOSE = 32  # that the choice looks at
+CHANNELS_TO_CHOOSE = 32  # those with the largest features, of maps that are no labels
 
 
 @dataclass(frozen=True, eq=False)
@@ -38,6 +38,7 @@ class Problem:
         worth: Factor of each view by stem; 1 if missing.
         deterministic: As of `lift_view`.
         done: Called with its stem after each product with a view.
+        channels: Of the maps, int64 [c]; None for all.
     """
 
     reader: MapReader
@@ -45,6 +46,7 @@ class Problem:
     worth: Mapping[str, float]
     deterministic: bool | None = None
     done: Callable[[str], None] = lambda stem: None
+    channels: Tensor | None = None
 
     def solve(self, prior: Tensor, ridge: float, iterations: int) -> Tensor:
         """Features [N, C] after so many iterations from the prior [N, C]."""
@@ -70,7 +72,7 @@ class Problem:
         """A^T R (F - A X) for some channels, float32 [N, c]."""
         total = torch.zeros_like(features)
         for view, found, worth in self._maps():
-            target, valid = _at_pixels(found, view, channels, features.device)
+            target, valid = map_at_pixels(found, view, channels, features.device)
             missed = target - self._render(view, found, features)
             difference = FeatureMap("difference", dense=missed, valid=valid)
             total += worth * self._transpose(view, difference).features
@@ -87,11 +89,21 @@ class Problem:
     def _maps(self) -> Iterator[tuple[View, FeatureMap, float]]:
         """The views that have a map, with it and their worth."""
         for view in self.views:
-            found = self.reader.read(view)
+            found = self.map_of(view)
             if found is not None:
                 with self.reader.log.stage("solve"):
                     yield view, found, self.worth.get(view.stem, 1.0)
                 self.done(view.stem)
+
+    def map_of(self, view: View) -> FeatureMap | None:
+        """The chosen channels of a view's map."""
+        found = self.reader.read(view)
+        if found is None or self.channels is None:
+            return found
+        if found.vectors is not None:
+            return FeatureMap(found.space, ids=found.ids, vectors=found.vectors[:, self.channels])
+        assert found.dense is not None
+        return FeatureMap(found.space, dense=found.dense[..., self.channels], valid=found.valid)
 
     def _render(self, view: View, found: FeatureMap, features: Tensor) -> Tensor:
         camera = view.camera.resized(*found.size)
@@ -149,7 +161,7 @@ def _valid(found: FeatureMap) -> Tensor | None:
     return (found.ids >= 0).any(dim=0) if found.ids is not None else found.valid
 
 
-def _at_pixels(found: FeatureMap, view: View, channels: slice, device: torch.device) -> tuple[Tensor, Tensor | None]:
+def map_at_pixels(found: FeatureMap, view: View, channels: slice, device: torch.device) -> tuple[Tensor, Tensor | None]:
     """Some channels of a map, zero where it says nothing, float32 [h, w, c], and where it does."""
     valid = _valid(found)
     if found.dense is not None:
@@ -178,25 +190,40 @@ def choose_ridge(problem: Problem, iterations: int) -> tuple[float, float]:
     if not held or not rest:
         return middle, math.nan
     reader = problem.reader
-    part = Problem(reader, rest, problem.worth, problem.deterministic, problem.done)
-    count = len(reader.gaussians)
-    sums = LiftSums.zeros(count, reader.kind[1], reader.gaussians.device)
-    for view in rest:
-        found = reader.read(view)
-        if found is not None:
-            options = {"settings": reader.settings, "deterministic": problem.deterministic}
-            lift_view(reader.gaussians, view.camera, found, sums, **options)  # type: ignore[arg-type]
-    means = sums.features / torch.where(sums.weight > 0, sums.weight, 1.0)[:, None]
-    seen = sums.weight.sign()
+    means, weight = _weighted(problem, rest)
+    few = None
+    if reader.kind[2] is None and means.shape[1] > CHANNELS_TO_CHOOSE:  # labels have few channels
+        few = means.square().sum(dim=0).topk(CHANNELS_TO_CHOOSE).indices.cpu()
+        means = means[:, few.to(means.device)]
+    part = replace(problem, views=rest, channels=few)
     best = (middle, math.inf)
     for ridge in RIDGES:
-        features = part.solve(means, ridge, iterations)
-        errors = []
-        for view in held:
-            found = reader.read(view)
-            if found is not None:
-                errors.append(residual(reader.gaussians, view.camera, found, features, seen, reader.settings))
-        error = sum(errors) / max(1, len(errors))
-        if errors and error < best[1]:
+        error = _missed(part, held, part.solve(means, ridge, iterations), weight)
+        if error < best[1]:
             best = ridge, error
     return best if math.isfinite(best[1]) else (middle, math.nan)
+
+
+def _weighted(problem: Problem, views: Sequence[View]) -> tuple[Tensor, Tensor]:
+    """Weighted means over some views, float32 [N, C], and 1 where they see a Gaussian, float32 [N]."""
+    reader = problem.reader
+    sums = LiftSums.zeros(len(reader.gaussians), reader.kind[1], reader.gaussians.device)
+    for view in views:
+        found = reader.read(view)
+        if found is not None:
+            lift_view(
+                *(reader.gaussians, view.camera, found, sums),
+                settings=reader.settings,
+                deterministic=problem.deterministic,
+            )
+    return sums.features / torch.where(sums.weight > 0, sums.weight, 1.0)[:, None], sums.weight.sign()
+
+
+def _missed(problem: Problem, views: Sequence[View], features: Tensor, weight: Tensor) -> float:
+    """Mean residual of features over some views; NaN if none has a map."""
+    reader, errors = problem.reader, []
+    for view in views:
+        found = problem.map_of(view)
+        if found is not None:
+            errors.append(residual(reader.gaussians, view.camera, found, features, weight, reader.settings))
+    return sum(errors) / len(errors) if errors else math.nan
