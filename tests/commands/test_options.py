@@ -480,5 +480,5 @@ def test_threads_are_those_of_the_run(stage_files, tmp_path):
 def test_every_command_is_tried_here():
     """A new command brings a test of its options; what an application takes is tested with it."""
     text = Path(__file__).read_text(encoding="utf-8")
-    tested_elsewhere = {"batch", "convert", "edit", "encoders", "info", "instances", "track"}
+    tested_elsewhere = {"batch", "convert", "edit", "encoders", "evaluate", "info", "instances", "track"}
     assert not [name for name in COMMANDS if f'"{name}"' not in text and name not in tested_elsewhere]
