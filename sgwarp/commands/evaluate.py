@@ -72,7 +72,7 @@ class Evaluate(Options):
     ensemble: Literal["2d", "3d", "max", "sum", "mean"] = "max"
     """As for `sgwarp segment`."""
 
-    scoring: Literal["evidence", "cosine"] | None = None
+    scoring: Literal["evidence", "cosine", "relevancy"] | None = None
     """As for `sgwarp segment`."""
 
     classes: tuple[str, ...] = ()

@@ -61,7 +61,7 @@ def test_refined_poses_are_a_data_set(boards, tmp_path):
     fitted = [view for index, view in enumerate(boards.views) if index % 4]
     assert [view.stem for view in refined] == [view.stem for view in fitted]
     shifts = [(one.camera.position - other.camera.position).norm() for one, other in zip(refined, fitted, strict=True)]
-    assert 0 < min(shifts) and max(shifts) < 0.1
+    assert min(shifts) > 0 and max(shifts) < 0.1
     assert str(tmp_path / "scene.ply.refined" / "transforms.json") in (tmp_path / "run.json").read_text()
 
 
