@@ -73,6 +73,7 @@ def prepare(scene: SceneData, settings: Settings, split: Split, log: RunLog) -> 
     case = Case(scene, settings, gaussians, lifted, scored, log)
     if settings.predicted:
         case.predicted = _on(load_semantics(in_scene(settings.predicted, scene), gaussians), gaussians)
+        case.predicted.require_scene(gaussians)
     if settings.semantics:
         path = in_scene(settings.semantics, scene)
         case.semantics = [_on(load_semantics(path, gaussians), gaussians)]
@@ -152,7 +153,10 @@ def _share(views: list[View], share: float) -> list[View]:
 
 def in_scene(pattern: str, scene: SceneData) -> Path:
     """A name of a file with the scene's name and folder put in."""
-    return Path(pattern.replace("{scene}", scene.name).replace("{path}", str(scene.folder)))
+    names = {"{scene}": scene.name, "{path}": str(scene.folder), "{file}": scene.name.replace("/", "__")}
+    for mark, value in names.items():
+        pattern = pattern.replace(mark, value)
+    return Path(pattern)
 
 
 def _on(semantics: Semantics, gaussians: Gaussians) -> Semantics:

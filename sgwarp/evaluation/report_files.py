@@ -16,7 +16,7 @@ from sgwarp.files.atomic import atomic_path
 from sgwarp.metrics.overlap import mean
 from sgwarp.version import __version__
 
-UNSHARED = {"residual"}  # figures that are no share of anything
+UNSHARED = {"residual", "held_out_residual", "switches"}  # figures that are no share of anything
 LIFT_STAGES = (
     "read",
     "gaussians_from_depth",

@@ -416,7 +416,7 @@ def test_weights_that_nobody_named_are_asked_for(profile, tmp_path, capsys):
 
 @pytest.mark.parametrize("kind", ["dense", "vectors"])
 def test_2d_alone_answers_from_the_vectors_of_the_view(kind, rooms, tmp_path, monkeypatch):
-    """One unit vector per class: the answer is the truth, at the size of the map, and nothing where there is no vector."""
+    """One unit vector per class: the answer is the truth at the size of the map, and nothing where none is."""
     folder = rooms / "one"
 
     class Source:
