@@ -11,7 +11,7 @@ import torch
 from torch import Tensor
 
 from sgwarp.errors import InputError
-from sgwarp.evaluation.cases import Case
+from sgwarp.evaluation.cases import Case, named_labels
 from sgwarp.querying.ensembles import score_together, seen_by
 from sgwarp.querying.scores import class_votes, relevancy
 from sgwarp.querying.segmentation import segment_votes, splat_scores
@@ -34,7 +34,7 @@ class Answers:
             with case.log.stage("answer"):
                 return self._labels_of_map(view, tuple(classes))
         first = case.semantics[0]
-        asked = [name for name in classes if first.labels is None or name in first.labels]  # no view shows the others
+        asked = askable(first, classes)
         if self._votes is None or self._votes[0] != tuple(asked):
             with case.log.stage("query"):
                 options = {"predicted": case.predicted, "ensemble": case.settings.ensemble}
@@ -92,7 +92,8 @@ class Answers:
     def _labels_of_map(self, view: View, classes: tuple[str, ...]) -> Tensor:
         found = self._map(self.case.sources[0], view)
         if found.labels is not None and found.ids is not None:
-            place = torch.tensor([*(classes.index(n) if n in classes else -1 for n in found.labels), -1])
+            names = named_labels(found.labels, self.case.scene.classes)
+            place = torch.tensor([*(classes.index(name) if name in classes else -1 for name in names), -1])
             return _resized(place[found.ids[0].long()], view)
         rows, ids = _as_semantics(found)
         votes = class_votes(rows, classes, self.case.text, scoring=self.case.settings.scoring).cpu()
@@ -113,6 +114,19 @@ class Answers:
             table = relevancy(rows, texts, self.case.text).cpu()
             maps = torch.cat([table, torch.zeros_like(table[:1])])[ids].permute(0, 3, 1, 2)
         return torch.nn.functional.interpolate(maps, view.camera.size, mode="bilinear")
+
+
+def askable(semantics: Semantics, classes: Sequence[str]) -> list[str]:
+    """The classes that can be asked: of lifted labels those that some view showed, else all.
+
+    Raises:
+        InputError: None can.
+    """
+    asked = [name for name in classes if semantics.labels is None or name in semantics.labels]
+    if not asked:
+        there = ", ".join(semantics.labels or ())
+        raise InputError(f"none of the classes ({', '.join(classes[:3])}, ..) is among the lifted labels: {there}")
+    return asked
 
 
 def _as_semantics(found: FeatureMap) -> tuple[Semantics, Tensor]:

@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 
 from sgwarp.datasets.base import resize_nearest
-from sgwarp.evaluation.answers import Answers
+from sgwarp.evaluation.answers import Answers, askable
 from sgwarp.evaluation.cases import Case
 from sgwarp.evaluation.profiles.base import Profile, add_confusion, total_of_values, total_pooled
 from sgwarp.evaluation.results import SceneResult
@@ -56,13 +56,14 @@ def score_room(case: Case, result: SceneResult, sheets: Path) -> None:
 def _locate(case: Case, truths: dict[str, Tensor]) -> list[float]:
     """Whether the best pixel of each class lies on it, in each scored view that shows it."""
     hits = []
+    asked = askable(case.semantics[0], case.scene.classes)
     with case.log.stage("locate"):
         options = {"predicted": case.predicted, "ensemble": case.settings.ensemble}
-        scores = score_texts(case.semantics[0], case.scene.classes, case.text, **options)  # type: ignore[arg-type]
+        scores = score_texts(case.semantics[0], asked, case.text, **options)  # type: ignore[arg-type]
         for view in case.scored:
             shown, known = splat_scores(case.gaussians, view.camera, scores.values, scores.seen)
-            for channel in range(len(case.scene.classes)):
-                mask = truths[view.stem] == channel
+            for channel, name in enumerate(asked):
+                mask = truths[view.stem] == case.scene.classes.index(name)
                 if int(mask.sum()) >= SMALLEST:
                     smooth = torch.where(known, box_mean(shown[..., channel], known, BOX), -torch.inf).cpu()
                     y, x = divmod(int(smooth.argmax()), view.camera.width)
@@ -92,8 +93,10 @@ def _of_gaussians(case: Case) -> dict[str, float]:
         return {}
     truth = torch.as_tensor(column).long()
     options = {"predicted": case.predicted, "ensemble": case.settings.ensemble, "scoring": case.settings.scoring}
-    votes = class_votes(case.semantics[0], case.scene.classes, case.text, **options)  # type: ignore[arg-type]
-    best, channel = votes.cpu().max(dim=1)
+    asked = askable(case.semantics[0], case.scene.classes)
+    votes = class_votes(case.semantics[0], asked, case.text, **options)  # type: ignore[arg-type]
+    best, column = votes.cpu().max(dim=1)
+    channel = torch.tensor([case.scene.classes.index(name) for name in asked])[column]
     known = (truth >= 0) & (truth < len(case.scene.classes))
     right = (channel == truth) & (best > 0)
     return {"accuracy_3d": float(right[known].float().mean()) if bool(known.any()) else float("nan")}
