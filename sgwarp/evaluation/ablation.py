@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import hashlib
+import json
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -16,12 +18,13 @@ from sgwarp.evaluation.report_files import ask_seconds, cell, method_seconds
 from sgwarp.evaluation.settings import Settings
 from sgwarp.evaluation.tables import NOTHING, Table, number, seconds_of, size
 from sgwarp.metrics.overlap import mean
+from sgwarp.network.inputs import InputMode
 from sgwarp.runs.log import RunLog
 from sgwarp.runs.progress import Report
 
 Axis = Literal["inputs", "gaussians", "views", "modes"]
 SHARES = (1.0, 0.5, 0.2, 0.1)
-INPUTS = ("full", "xyz-rgb")
+INPUTS: tuple[InputMode, ...] = ("full", "xyz-rgb")
 
 
 @dataclass(frozen=True)
@@ -33,14 +36,14 @@ class Variant:
         value: To what, as in the table.
         folder: Of its results, below `ablations`; "" for what was evaluated already.
         settings: The choices.
-        inputs: Of the network that has to be trained first; "" if none.
+        inputs: Of the network that has to be trained first; None if none has.
     """
 
     axis: Axis
     value: str
     folder: str
     settings: Settings
-    inputs: str = ""
+    inputs: InputMode | None = None
 
 
 @dataclass
@@ -147,7 +150,7 @@ def _try(
     folder, settings, training = out / "ablations" / variant.folder, variant.settings, 0.0
     try:
         if variant.inputs:
-            place = out / "ablations" / f"network_{variant.inputs}"
+            place = out / "ablations" / f"network_{_key(found, network)}" / variant.inputs
             pattern, training = train_and_predict(found.profile, data, place, settings, scenes, variant.inputs, network)
             settings = replace(settings, predicted=pattern)
         return Trial(variant, evaluate(found.profile, data, folder, settings, scenes=scenes), "", training)
@@ -155,11 +158,26 @@ def _try(
         return Trial(variant, None, str(error))
 
 
+def _key(found: Evaluation, network: NetworkSettings) -> str:
+    """Of all that lifted features and networks depend on: other choices get a folder of their own."""
+    choices = [
+        found.profile.name,
+        found.settings.identity,
+        network.epochs,
+        network.arch,
+        network.voxel,
+        str(network.train),
+    ]
+    return hashlib.sha256(json.dumps(choices, sort_keys=True).encode()).hexdigest()[:8]
+
+
 def ablation_table(ablation: Ablation) -> Table:
     """Every variant in a row: accuracy beside seconds, memory and bytes."""
     names = [*ablation.profile.headline]
     names += [name for name in ("accuracy_3d", "held_out_residual") if _has(ablation, name)]
-    rows, rules, before = [], set(), ""
+    rows: list[list[str]] = []
+    rules: set[int] = set()
+    before = ""
     for trial in ablation.trials:
         axis = trial.variant.axis
         if before and axis != before:

@@ -15,6 +15,7 @@ from sgwarp.files.atomic import atomic_path
 from sgwarp.files.documents import read_json
 from sgwarp.io.scenes import save_gaussians
 from sgwarp.io.store import save_semantics
+from sgwarp.network.inputs import InputMode
 from sgwarp.network.prediction import predict
 from sgwarp.network.semantic_network import load_network, save_network
 from sgwarp.network.training.data import scenes_in
@@ -48,7 +49,7 @@ def train_and_predict(
     folder: Path,
     settings: Settings,
     scenes: Sequence[str],
-    inputs: str,
+    inputs: InputMode,
     network: NetworkSettings,
 ) -> tuple[str, float]:
     """Pattern of the files with what a network with these inputs predicts, and the seconds that its training took.
@@ -71,7 +72,7 @@ def train_and_predict(
             inputs=inputs,
             voxel=network.voxel,
             epochs=network.epochs,
-            augment=None,  # type: ignore[arg-type]
+            augment=None,
         )
         folder.mkdir(parents=True, exist_ok=True)
         paths = [lifted / f"{_file(name)}.ply" for name in names]

@@ -90,7 +90,7 @@ def test_inputs_train_a_network_each(rooms, tmp_path):
         found["inputs", "3D, inputs full"]["lifting_or_training"]
         > found["inputs", "2D alone, no network"]["lifting_or_training"]
     )
-    networks = {path: path.stat().st_mtime_ns for path in out.glob("ablations/network_*/network.safetensors")}
+    networks = {path: path.stat().st_mtime_ns for path in out.glob("ablations/network_*/*/network.safetensors")}
     assert len(networks) == 2
     assert evaluate(rooms, out, "--ablate", "inputs", "--epochs", "1") == 0
     assert {path: path.stat().st_mtime_ns for path in networks} == networks

@@ -97,3 +97,11 @@ def test_methods():
     with pytest.raises(InputError, match="does not exist"):
         find_method("magic")
     assert Method("x", "y", make="math:sqrt").kind == "rival"
+
+
+def test_the_command_offers_every_profile():
+    from typing import get_args, get_type_hints
+
+    from sgwarp.commands.evaluate import Evaluate
+
+    assert get_args(get_args(get_type_hints(Evaluate, include_extras=True)["profile"])[0]) == tuple(PLACES)
