@@ -41,7 +41,7 @@ class Batch:
 
     do: str
     """What to do with each, separated by commas: fit, lift, predict, segment, instances,
-    render."""
+    render, evaluate."""
 
     out: Path
     """Folder of the results, one folder per scene."""

@@ -8,14 +8,17 @@ from typing import TYPE_CHECKING, Literal
 
 import tyro
 
-from sgwarp.commands.options import Options, check_folder
+from sgwarp.commands.options import Options, check_folder, notices_held_back
 from sgwarp.errors import InputError
 from sgwarp.runs.progress import show_progress
 
 if TYPE_CHECKING:
+    from sgwarp.evaluation.ablation import Axis
     from sgwarp.evaluation.evaluator import Evaluation
     from sgwarp.evaluation.profiles.base import Profile
     from sgwarp.evaluation.settings import Settings
+    from sgwarp.evaluation.tables import Table
+    from sgwarp.runs.log import RunLog
 
 
 @dataclass(kw_only=True)
@@ -72,7 +75,7 @@ class Evaluate(Options):
     ensemble: Literal["2d", "3d", "max", "sum", "mean"] = "max"
     """As for `sgwarp segment`."""
 
-    scoring: Literal["evidence", "cosine"] | None = None
+    scoring: Literal["evidence", "cosine", "relevancy"] | None = None
     """As for `sgwarp segment`."""
 
     classes: tuple[str, ...] = ()
@@ -102,6 +105,16 @@ class Evaluate(Options):
     forgetting: float = 0.9
     """Of moving scenes: weight of the past after one more frame; 0 takes every frame alone, as the paper does."""
 
+    ablate: str | None = None
+    """Evaluate again with one thing changed: inputs, gaussians, views, modes, separated by commas. "inputs" trains
+    networks."""
+
+    epochs: int = 30
+    """Of the networks of --ablate inputs."""
+
+    train: Path | None = None
+    """Root of a data set that those networks learn from; the evaluated scenes themselves if not given."""
+
     sheets: int = 3
     """Views to draw per scene."""
 
@@ -119,17 +132,20 @@ class Evaluate(Options):
             from sgwarp.evaluation.profiles.catalogue import find_profile
             from sgwarp.evaluation.report_files import headline, write_tables
 
+            axes = None if self.ablate is None else self._axes()
             profile = find_profile(self.profile)
             settings = self._settings(profile)
             with show_progress("evaluate") as progress:
                 found = evaluate(
                     profile, self.data, self.out, settings, scenes=self.scenes or None, log=log, progress=progress
                 )
-            paths = write_tables(found, self.out)
+            extra = [] if axes is None else self._ablate(found, axes, log)
+            paths = write_tables(found, self.out, extra)
             log.error |= {name: value for name, value in found.figures.items()}
             log.error["failed"] = len(found.failed)
             log.outputs += [str(path) for path in paths]
-            print(headline(found).markdown())
+            for table in (headline(found), *extra):
+                print(table.markdown())
             self._say_failed(found)
         return 1 if found.failed else 0
 
@@ -155,6 +171,36 @@ class Evaluate(Options):
             raise InputError(f"--{error}") from None
         find_method(settings.method)
         return settings
+
+    def _axes(self) -> tuple[Axis, ...]:
+        from sgwarp.evaluation.ablation import parse_axes
+
+        if self.semantics:
+            raise InputError("--ablate: lifts anew each time; leave --semantics out")
+        return parse_axes(self.ablate or "")
+
+    def _ablate(self, found: Evaluation, axes: tuple[Axis, ...], log: RunLog) -> list[Table]:
+        """Table of the variants; ablation.json and, with matplotlib, ablation.png are written."""
+        import json
+
+        from sgwarp.evaluation.ablation import ablate, ablation_table, as_rows, draw_ablation
+        from sgwarp.evaluation.networks import NetworkSettings
+        from sgwarp.evaluation.results import finite
+        from sgwarp.files.atomic import atomic_path
+
+        network = NetworkSettings(epochs=self.epochs, train=self.train)
+        with notices_held_back(), show_progress("ablate") as progress:
+            ablation = ablate(found, self.data, self.out, axes, network, log=log, progress=progress)
+        path = self.out / "ablation.json"
+        with atomic_path(path) as temporary:
+            temporary.write_text(json.dumps(finite(as_rows(ablation)), indent=1) + "\n", encoding="utf-8")
+        log.outputs.append(str(path))
+        if draw_ablation(ablation, self.out / "ablation.png"):
+            log.outputs.append(str(self.out / "ablation.png"))
+        for trial in ablation.trials:
+            if trial.error:
+                print(f"{trial.variant.axis} {trial.variant.value}: {trial.error}")
+        return [ablation_table(ablation)]
 
     def _require_encoder(self, name: str) -> None:
         """Refuse an encoder that stands for weights that nobody named.

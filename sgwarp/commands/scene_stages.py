@@ -14,6 +14,7 @@ from typing import Any
 
 from sgwarp.cluster.listing import Scene
 from sgwarp.cluster.tasks import OUT, Stage
+from sgwarp.commands.evaluate import Evaluate
 from sgwarp.commands.fit import Fit
 from sgwarp.commands.instances import Instances
 from sgwarp.commands.lift import Lift
@@ -30,6 +31,7 @@ COMMANDS: dict[str, type[Options]] = {
     "segment": Segment,
     "instances": Instances,
     "render": Render,
+    "evaluate": Evaluate,
 }
 SCENE, LIFTED, PREDICTED = f"{OUT}/scene.ply", f"{OUT}/scene.safetensors", f"{OUT}/predicted.safetensors"
 OUTPUTS = {
@@ -39,10 +41,12 @@ OUTPUTS = {
     "segment": f"{OUT}/labels",
     "instances": f"{OUT}/instances.safetensors",
     "render": f"{OUT}/renders",
+    "evaluate": f"{OUT}/evaluation",
 }
 COMMON = ("views", "scene")  # options of a scene that name its files
 FIXED = ("out", "device", "threads", "command_line", "resume", *COMMON)  # not options of a stage
 NO_INPUT = ("cache",)  # what lies there does not change the results
+PROFILE = "room"  # of an evaluation that names none
 
 
 @dataclass(frozen=True)
@@ -85,7 +89,10 @@ def stages_of(scene: Scene, plan: Plan) -> tuple[tuple[Stage, ...], tuple[str, .
     stages = []
     for name in plan.stages:
         given = _given(COMMANDS[name], name, own)
-        words = [str(views)] if name == "fit" else [str(gaussians)]
+        if name == "evaluate":
+            words = _evaluation(scene, given, plan.stages, gaussians)
+        else:
+            words = [str(views)] if name == "fit" else [str(gaussians)]
         if name in ("lift", "segment", "instances", "render"):
             words += ["--views", str(views)]
         if name == "segment":
@@ -101,6 +108,19 @@ def stages_of(scene: Scene, plan: Plan) -> tuple[tuple[Stage, ...], tuple[str, .
         stages.append(Stage(name, tuple(words)))
     inputs += [str(path) for path in (views, gaussians) if not str(path).startswith(OUT)]
     return tuple(stages), tuple(sorted(set(inputs)))
+
+
+def _evaluation(scene: Scene, given: dict[Field[Any], str], stages: Sequence[str], gaussians: Path) -> list[str]:
+    """Words of an evaluation; what it asks is what this batch made, where it says nothing else. `given` loses them."""
+    own = {option.name: option for option in given}
+    profile = given.pop(own["profile"]) if "profile" in own else PROFILE
+    words = [profile] if "data" in own else [profile, "--data", str(scene.path)]
+    if "gaussians" not in own:
+        words += ["--gaussians", str(gaussians)]
+    for name, stage in (("semantics", "lift"), ("predicted", "predict")):
+        if stage in stages and name not in own:
+            words += [f"--{name}", OUTPUTS[stage]]
+    return words
 
 
 def run_stage(name: str, arguments: Sequence[str]) -> None:

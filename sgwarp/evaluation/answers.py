@@ -10,16 +10,13 @@ from collections.abc import Sequence
 import torch
 from torch import Tensor
 
-from sgwarp.encoders.prompts import CANONICAL
 from sgwarp.errors import InputError
-from sgwarp.evaluation.cases import Case
+from sgwarp.evaluation.cases import Case, named_labels
 from sgwarp.querying.ensembles import score_together, seen_by
 from sgwarp.querying.scores import class_votes, relevancy
 from sgwarp.querying.segmentation import segment_votes, splat_scores
 from sgwarp.rendering.renderer import render
 from sgwarp.scene import FeatureMap, Semantics, View
-
-SCALE = 10.0  # of the relevancy's softmax (LERF)
 
 
 class Answers:
@@ -37,7 +34,7 @@ class Answers:
             with case.log.stage("answer"):
                 return self._labels_of_map(view, tuple(classes))
         first = case.semantics[0]
-        asked = [name for name in classes if first.labels is None or name in first.labels]  # no view shows the others
+        asked = askable(first, classes)
         if self._votes is None or self._votes[0] != tuple(asked):
             with case.log.stage("query"):
                 options = {"predicted": case.predicted, "ensemble": case.settings.ensemble}
@@ -95,11 +92,15 @@ class Answers:
     def _labels_of_map(self, view: View, classes: tuple[str, ...]) -> Tensor:
         found = self._map(self.case.sources[0], view)
         if found.labels is not None and found.ids is not None:
-            place = torch.tensor([*(classes.index(n) if n in classes else -1 for n in found.labels), -1])
+            names = named_labels(found.labels, self.case.scene.classes)
+            place = torch.tensor([*(classes.index(name) if name in classes else -1 for name in names), -1])
             return _resized(place[found.ids[0].long()], view)
-        cosines = self._cosines(found, list(classes))[0]
-        best = cosines.argmax(dim=2)
-        return _resized(torch.where(cosines.isfinite().all(dim=2), best, -1), view)
+        rows, ids = _as_semantics(found)
+        votes = class_votes(rows, classes, self.case.text, scoring=self.case.settings.scoring).cpu()
+        shares = torch.cat([votes, torch.zeros_like(votes[:1])])[ids]  # the last row is id -1
+        shares = shares.sum(dim=0) / (ids >= 0).sum(dim=0).clamp(min=1)[..., None]
+        best, channel = shares.max(dim=2)
+        return _resized(torch.where((best > 0) & (best >= 1.0 - shares.sum(dim=2)), channel, -1), view)
 
     def _relevancy_of_map(self, source: object, view: View, texts: Sequence[str]) -> Tensor:
         found = self._map(source, view)
@@ -107,27 +108,41 @@ class Answers:
             index = torch.tensor([found.labels.index(text) if text in found.labels else -2 for text in texts])
             maps = (found.ids[:, None] == index[None, :, None, None]).float()
         else:
-            cosines = self._cosines(found, [*texts, *CANONICAL])
-            wanted, rivals = cosines[..., : len(texts)], cosines[..., len(texts) :].amax(dim=-1, keepdim=True)
-            maps = torch.sigmoid(SCALE * (wanted - rivals)).nan_to_num(0.0).permute(0, 3, 1, 2)
+            if self.case.text is None:
+                raise InputError(f"space '{found.space}' has no text encoder here; labels are asked by name")
+            rows, ids = _as_semantics(found)
+            table = relevancy(rows, texts, self.case.text).cpu()
+            maps = torch.cat([table, torch.zeros_like(table[:1])])[ids].permute(0, 3, 1, 2)
         return torch.nn.functional.interpolate(maps, view.camera.size, mode="bilinear")
 
-    def _cosines(self, found: FeatureMap, texts: Sequence[str]) -> Tensor:
-        """Cosines of a map's pixels with texts, NaN where it holds nothing, [L, h, w, Q]."""
-        if self.case.text is None:
-            raise InputError(f"space '{found.space}' has no text encoder here; labels are asked by name")
-        vectors = self.case.text.encode_text(list(texts)).cpu()
-        if found.dense is not None:
-            dense = found.dense.float().cpu()
-            cosines = torch.nn.functional.normalize(dense, dim=2) @ vectors.T
-            return (
-                cosines[None] if found.valid is None else torch.where(found.valid[..., None], cosines, torch.nan)[None]
-            )
+
+def askable(semantics: Semantics, classes: Sequence[str]) -> list[str]:
+    """The classes that can be asked: of lifted labels those that some view showed, else all.
+
+    Raises:
+        InputError: None can.
+    """
+    asked = [name for name in classes if semantics.labels is None or name in semantics.labels]
+    if not asked:
+        there = ", ".join(semantics.labels or ())
+        raise InputError(f"none of the classes ({', '.join(classes[:3])}, ..) is among the lifted labels: {there}")
+    return asked
+
+
+def _as_semantics(found: FeatureMap) -> tuple[Semantics, Tensor]:
+    """The vectors of a map as if each were a Gaussian's, and which one each pixel has, -1 = none, int64 [L, h, w]."""
+    if found.dense is not None:
+        height, width = found.size
+        ids = torch.arange(height * width).view(1, height, width)
+        ids = ids if found.valid is None else torch.where(found.valid.cpu(), ids, -1)
+        rows = found.dense.reshape(height * width, -1).float().cpu()
+    else:
         assert found.ids is not None
         assert found.vectors is not None
-        table = torch.nn.functional.normalize(found.vectors.cpu(), dim=1) @ vectors.T
-        table = torch.cat([table, torch.full_like(table[:1], torch.nan)])  # the last row is id -1
-        return table[found.ids.long()]
+        rows, ids = found.vectors.cpu(), found.ids.long().cpu()
+    weight = torch.zeros(len(rows))
+    weight[ids[ids >= 0]] = 1.0
+    return Semantics(rows, weight, weight.clone(), found.space, "one view"), ids
 
 
 def _resized(labels: Tensor, view: View) -> Tensor:

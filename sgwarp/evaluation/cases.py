@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 import torch
@@ -72,10 +72,11 @@ def prepare(scene: SceneData, settings: Settings, split: Split, log: RunLog) -> 
     gaussians = _gaussians(scene, settings, lifted, log)
     case = Case(scene, settings, gaussians, lifted, scored, log)
     if settings.predicted:
-        case.predicted = _on(load_semantics(in_scene(settings.predicted, scene), gaussians), gaussians)
+        case.predicted = _on(load_semantics(in_scene(settings.predicted, scene), gaussians), gaussians, scene)
+        case.predicted.require_scene(gaussians)
     if settings.semantics:
         path = in_scene(settings.semantics, scene)
-        case.semantics = [_on(load_semantics(path, gaussians), gaussians)]
+        case.semantics = [_on(load_semantics(path, gaussians), gaussians, scene)]
         log.error["coverage"] = case.semantics[0].coverage
         case.text = _text(case.semantics[0].space, read_notes(path).get("encoder"), settings)
         return case
@@ -99,7 +100,8 @@ def _lift(case: Case) -> None:
         raise InputError(f"{scene.folder}: scene {scene.name} has no view left to lift from; lower --hold-out")
     chosen = _share(case.lifted, settings.share_of_views)
     for source in case.sources:
-        case.semantics.append(_on(method.lifting()(case.gaussians, chosen, source, log=log), case.gaussians))
+        lifted = method.lifting()(case.gaussians, chosen, source, log=log)
+        case.semantics.append(_on(lifted, case.gaussians, scene))
 
 
 def _source(name: str, scene: SceneData, views: list[View], settings: Settings) -> MapSource:
@@ -152,14 +154,25 @@ def _share(views: list[View], share: float) -> list[View]:
 
 def in_scene(pattern: str, scene: SceneData) -> Path:
     """A name of a file with the scene's name and folder put in."""
-    return Path(pattern.replace("{scene}", scene.name).replace("{path}", str(scene.folder)))
+    names = {"{scene}": scene.name, "{path}": str(scene.folder), "{file}": scene.name.replace("/", "__")}
+    for mark, value in names.items():
+        pattern = pattern.replace(mark, value)
+    return Path(pattern)
 
 
-def _on(semantics: Semantics, gaussians: Gaussians) -> Semantics:
-    from dataclasses import replace
-
+def _on(semantics: Semantics, gaussians: Gaussians, scene: SceneData) -> Semantics:
     names = ("features", "weight", "effective_views")
-    return replace(semantics, **{name: getattr(semantics, name).to(gaussians.device) for name in names})
+    moved = {name: getattr(semantics, name).to(gaussians.device) for name in names}
+    labels = None if semantics.labels is None else named_labels(semantics.labels, scene.classes)
+    return replace(semantics, **moved, labels=labels)
+
+
+def named_labels(labels: Sequence[str], classes: Sequence[str]) -> tuple[str, ...]:
+    """Labels by name, where they are the ids that a data set stores: class k has id k + 1."""
+    ids = [int(label) for label in labels if label.isdecimal()]
+    if not classes or len(ids) < len(labels) or max(ids, default=0) > len(classes) or set(labels) <= set(classes):
+        return tuple(labels)
+    return tuple(classes[number - 1] for number in ids)
 
 
 def split_by_number(scene: SceneData, views: Sequence[View], settings: Settings) -> tuple[list[View], list[View]]:

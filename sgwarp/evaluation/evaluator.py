@@ -127,7 +127,7 @@ def evaluate_scene(
     result.seconds = {stage: round(value, 4) for stage, value in log.stages.items()}
     result.peak_memory, result.gaussians = peak(), len(case.gaussians)
     result.bytes_per_gaussian = case.bytes_per_gaussian
-    result.views = {"lifted": len(case.lifted), "scored": len(case.scored)}
+    result.views = {"lifted": 0 if settings.semantics else len(case.lifted), "scored": len(case.scored)}
     result.left_out = dict(log.left_out)
     result.sheets = [f"scenes/{folder.name}/{sheet}" for sheet in result.sheets]
     write_result(folder / FILE, result, identity)

@@ -86,7 +86,7 @@ IMAGES = Method("2d", "the 2D encoder alone, on the asked view itself", "images"
 RIVALS: tuple[Method, ...] = ()
 
 
-def methods() -> tuple[Method, ...]:
+def list_methods() -> tuple[Method, ...]:
     """Every method: the lift modes, the rivals, and the 2D encoder alone."""
     modes = (
         Method(mode, ABOUT_MODES.get(mode, f"lift mode {mode}"), "mode", "sgwarp.lifting.lifter:lift", {"mode": mode})
@@ -101,7 +101,7 @@ def find_method(name: str) -> Method:
     Raises:
         InputError: There is none.
     """
-    found = {method.name: method for method in methods()}
+    found = {method.name: method for method in list_methods()}
     if name not in found:
         raise InputError(f"method '{name}' does not exist; there are {', '.join(found)}")
     return found[name]

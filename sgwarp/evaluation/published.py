@@ -43,7 +43,7 @@ def _content() -> dict[str, Any]:
     return content
 
 
-def published(profile: str) -> tuple[Published, ...]:
+def find_published(profile: str) -> tuple[Published, ...]:
     """Systems with figures under a protocol, in the order of the file; none if there are none."""
     content = _content()
     entry = content["profiles"].get(profile, {"rows": []})

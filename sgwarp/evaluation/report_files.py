@@ -9,14 +9,14 @@ from typing import Any
 
 from sgwarp.evaluation.evaluator import Evaluation
 from sgwarp.evaluation.profiles.base import pooled
-from sgwarp.evaluation.published import Published, published
+from sgwarp.evaluation.published import Published, find_published
 from sgwarp.evaluation.results import finite
 from sgwarp.evaluation.tables import NOTHING, Table, number, percent, seconds_of, size
 from sgwarp.files.atomic import atomic_path
 from sgwarp.metrics.overlap import mean
 from sgwarp.version import __version__
 
-UNSHARED = {"residual"}  # figures that are no share of anything
+UNSHARED = {"residual", "held_out_residual", "switches"}  # figures that are no share of anything
 LIFT_STAGES = (
     "read",
     "gaussians_from_depth",
@@ -60,7 +60,7 @@ def as_record(found: Evaluation) -> dict[str, Any]:
         "seconds": found.seconds,
         "peak_memory": max(result.peak_memory for result in found.results),
         "bytes_per_gaussian": mean(result.bytes_per_gaussian for result in found.results),
-        "published": [asdict(row) for row in published(profile.name)],
+        "published": [asdict(row) for row in find_published(profile.name)],
         "differences": list(profile.differences),
     }
 
@@ -94,7 +94,7 @@ def headline(found: Evaluation) -> Table:
             "this run",
         ]
     ]
-    rows += [_published_row(row, names) for row in published(found.profile.name)]
+    rows += [_published_row(row, names) for row in find_published(found.profile.name)]
     columns = ["system", *names, "lifting [s]", "asking [s]", "memory", "B/Gaussian", "source"]
     return Table("Results", columns, rows, frozenset({"source", "lifting [s]"}), frozenset({0}))
 

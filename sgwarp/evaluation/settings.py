@@ -5,9 +5,9 @@ from __future__ import annotations
 from dataclasses import asdict, dataclass
 from typing import Any, Literal
 
+from sgwarp.encoders.calibration import Scoring
 from sgwarp.errors import InputError
 from sgwarp.querying.ensembles import Ensemble
-from sgwarp.querying.scores import Scoring
 
 Views = Literal["released", "strict"]
 
@@ -25,7 +25,7 @@ class Settings:
         semantics: Lifted before, by `sgwarp lift`; then nothing is lifted.
         predicted: By `sgwarp predict`, asked together with the lifted semantics.
         ensemble: How the two become one.
-        scoring: Of classes, see `class_votes`.
+        scoring: Of classes, see `class_votes`; what the encoder is calibrated for if None.
         classes: Names to ask for, where the data set names none.
         threshold: Of `score_texts`, above which a Gaussian is selected.
         views: "strict" never lifts from views that are scored; "released" lifts all, as the published scripts do.
@@ -48,7 +48,7 @@ class Settings:
     semantics: str = ""
     predicted: str = ""
     ensemble: Ensemble = "max"
-    scoring: Scoring = "cosine"
+    scoring: Scoring | None = None
     classes: tuple[str, ...] = ()
     threshold: float = 0.5
     views: Views = "strict"

@@ -102,3 +102,44 @@ def test_a_scene_goes_from_stage_to_stage(scans):
 def test_fit_needs_photographs(scans):
     with pytest.raises(InputError, match="starts from photographs"):
         stages_of(Scene("x", scans / "one" / "scene.ply"), Plan(("fit",), {}, "cpu"))
+
+
+@pytest.fixture(scope="module")
+def labeled(scans, tmp_path_factory):
+    """The two sound scenes with names of their classes."""
+    folder = tmp_path_factory.mktemp("labeled")
+    for name in ("one", "two"):
+        shutil.copytree(scans / name, folder / name)
+        (folder / name / "classes.json").write_text('["wall", "left door", "lamp", "book"]')
+    return folder
+
+
+def test_a_list_of_scenes_is_evaluated(labeled, tmp_path, capsys):
+    options = ("evaluate.encoder=truth", "evaluate.hold-out=2", "evaluate.sheets=0")
+    assert run(labeled, "--do", "evaluate", "--out", tmp_path / "out", "--threads", 1, "--options", *options) == 0
+    for name in ("one", "two"):
+        own = json.loads((tmp_path / "out" / name / "evaluation" / "results.json").read_text())
+        assert list(own["scenes"]) == [name]
+        assert own["figures"]["miou"] > 0.5
+        done = json.loads((tmp_path / "out" / name / "done.json").read_text())
+        assert done["figures"]["evaluate"]["miou"] == own["figures"]["miou"]
+    capsys.readouterr()
+    assert run(labeled, "--do", "evaluate", "--out", tmp_path / "out", "--threads", 1, "--options", *options) == 0
+    assert "2 skipped" in capsys.readouterr().out
+
+
+def test_what_a_batch_lifted_is_what_it_evaluates(labeled, tmp_path):
+    options = ("lift.encoder=files:{path}/labels", "evaluate.encoder=truth", "evaluate.scenes=one")
+    plan = Plan(("lift", "evaluate"), dict(option.split("=", 1) for option in options), "cpu")
+    scene = Scene("one", labeled / "one")
+    lift, evaluate = stages_of(scene, plan)[0]
+    words = list(evaluate.arguments)
+    assert words[:3] == ["room", "--data", str(labeled / "one")]
+    assert words[words.index("--semantics") + 1] == lift.arguments[lift.arguments.index("--out") + 1]
+    assert words[words.index("--gaussians") + 1] == str(labeled / "one" / "scene.ply")
+    parse("evaluate", words)
+    named = Plan(("evaluate",), {"evaluate.profile": "lerf-mask", "evaluate.data": str(labeled)}, "cpu")
+    words = list(stages_of(scene, named)[0][0].arguments)
+    assert words[0] == "lerf-mask"
+    assert words.count("--data") == 1
+    assert "--semantics" not in words

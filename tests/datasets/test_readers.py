@@ -1,10 +1,13 @@
 """Readers of published data sets, on small files in the published format."""
 
+import json
+
 import cv2
 import numpy as np
 import pytest
 import torch
 
+from sgwarp.cli import main
 from sgwarp.datasets import (
     labelled_folder,
     lerf_mask,
@@ -389,3 +392,17 @@ def test_resizing_mixes_no_labels():
     large = torch.randint(0, 5, (97, 131), generator=torch.Generator().manual_seed(0))
     exact = cv2.resize(large.numpy().astype(np.uint8), (64, 48), interpolation=cv2.INTER_NEAREST_EXACT)
     assert np.array_equal(resize_nearest(large, (48, 64)).numpy(), exact)
+
+
+def test_info_lists_scenes_and_what_is_missing(writer, capsys):
+    write_lerf_ovs(writer)
+    (writer.folder / "ramen/images/frame_00024.jpg").unlink()
+    assert main(["info", str(writer.folder)]) == 0
+    said = capsys.readouterr().out
+    assert "data set: lerf-ovs" in said
+    assert "frames: 2" in said
+    assert "missing: images/frame_00024.jpg" in said
+    assert main(["info", str(writer.folder), "--data-set", "lerf-ovs", "--json"]) == 0
+    assert json.loads(capsys.readouterr().out)["by_scene"]["ramen"]["labelled"] == 1
+    assert main(["info", str(writer.folder), "--data-set", "scannet"]) == 2
+    assert "holds no scene of 'scannet'" in capsys.readouterr().err

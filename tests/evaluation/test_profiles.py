@@ -412,3 +412,41 @@ def test_moving_scene_end_to_end(tmp_path):
 def test_weights_that_nobody_named_are_asked_for(profile, tmp_path, capsys):
     assert main(["evaluate", profile, "--data", str(tmp_path), "--out", str(tmp_path / "out")]) == 2
     assert f"--encoder: profile {profile} is published with" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("kind", ["dense", "vectors"])
+def test_2d_alone_answers_from_the_vectors_of_the_view(kind, rooms, tmp_path, monkeypatch):
+    """One unit vector per class: the answer is the truth at the size of the map, and nothing where none is."""
+    folder = rooms / "one"
+
+    class Source:
+        space, needs_image = "names:10", False
+
+        def encode(self, view, image=None):
+            ids = torch.from_numpy(truth_of(folder, view.stem)).long()[::2, ::2] - 1
+            ids[:4] = -1
+            if kind == "vectors":
+                return FeatureMap(self.space, ids=ids, vectors=torch.eye(10))
+            return FeatureMap(self.space, dense=torch.eye(10)[ids.clamp(min=0)], valid=ids >= 0)
+
+    class Text:
+        space = "names:10"
+
+        def encode_text(self, texts):
+            return torch.eye(10)[[CLASSES.index(text) for text in texts]]
+
+    monkeypatch.setattr("sgwarp.evaluation.cases.make_encoder", lambda *rest: Source())
+    monkeypatch.setattr("sgwarp.evaluation.cases.text_encoder_for", lambda *rest: Text())
+    found = run("room", rooms, tmp_path, "--scenes", "one", "--method", "2d", "--scoring", "cosine")
+    figures = found["scenes"]["one"]["figures"]
+    pairs = []
+    for stem in ("0000", "0008"):
+        truth = truth_of(folder, stem).astype(int) - 1
+        ours = truth[::2, ::2].copy()
+        ours[:4] = -1
+        pairs.append((np.repeat(np.repeat(ours, 2, 0), 2, 1), truth))
+    right = sum(((p == t) & (t >= 0)).sum() for p, t in pairs)
+    assert figures["accuracy"] == pytest.approx(right / sum((t >= 0).sum() for _, t in pairs))
+    assert figures["unknown"] == pytest.approx(
+        sum(((p < 0) & (t >= 0)).sum() for p, t in pairs) / (2 * 48 * 64), abs=1e-3
+    )

@@ -163,3 +163,35 @@ def test_what_is_refused(rooms, tmp_path, capsys, options, message):
 def test_a_folder_without_scenes_is_refused(tmp_path, capsys):
     assert evaluate(tmp_path, tmp_path / "out") == 2
     assert "holds no scene of data set 'folder'" in capsys.readouterr().err
+
+
+def test_what_was_lifted_before_is_asked(rooms, tmp_path):
+    """Ids of label images, class k + 1, stand for the classes; nothing is lifted again."""
+    folder = rooms / "one"
+    maps = shutil.copytree(folder / "labels", tmp_path / "maps")
+    for stem in ("0000", "0008"):
+        (maps / f"{stem}.png").unlink()
+    lifted = tmp_path / "one.safetensors"
+    assert (
+        main(
+            [
+                "lift",
+                str(folder / "scene.ply"),
+                "--views",
+                str(folder),
+                "--encoder",
+                f"files:{maps}",
+                "--out",
+                str(lifted),
+            ]
+        )
+        == 0
+    )
+    options = ["--scenes", "one", "--sheets", "0"]
+    assert evaluate(rooms, tmp_path / "here", *options) == 0
+    assert evaluate(rooms, tmp_path / "before", *options, "--semantics", str(tmp_path / "{scene}.safetensors")) == 0
+    here, before = (results(tmp_path / name)["scenes"]["one"] for name in ("here", "before"))
+    assert before["figures"]["miou"] == pytest.approx(here["figures"]["miou"], abs=1e-6)
+    assert before["figures"]["accuracy_3d"] == pytest.approx(here["figures"]["accuracy_3d"], abs=1e-6)
+    assert "lift" not in before["seconds"]
+    assert before["views"]["lifted"] == 0

@@ -5,9 +5,9 @@ import json
 import pytest
 
 from sgwarp.errors import InputError
-from sgwarp.evaluation.methods import METHOD_KINDS, Method, find_method, methods
+from sgwarp.evaluation.methods import METHOD_KINDS, Method, find_method, list_methods
 from sgwarp.evaluation.profiles.catalogue import PLACES, find_profile
-from sgwarp.evaluation.published import FILE, published
+from sgwarp.evaluation.published import FILE, find_published
 from sgwarp.evaluation.tables import Table, number, percent, seconds_of, size
 
 
@@ -43,11 +43,11 @@ def test_published_figures_have_sources_and_are_shares():
     content = json.loads(FILE.read_text())
     assert set(content["profiles"]) >= set(PLACES)
     for profile in content["profiles"]:
-        for row in published(profile):
+        for row in find_published(profile):
             assert row.source
             assert row.figures
             assert all(0 < value < 1 for value in (*row.figures.values(), *row.scenes.values())), row.system
-    paper = {row.system: row for row in published("scannet12-2d")}
+    paper = {row.system: row for row in find_published("scannet12-2d")}
     assert paper["Semantic Gaussians 2D+3D"].figures == {"miou": pytest.approx(0.62), "macc": pytest.approx(0.77)}
     wanted = {
         "Mask2Former",
@@ -67,7 +67,7 @@ def test_published_figures_have_sources_and_are_shares():
 
 def test_means_of_published_scenes_are_the_published_means():
     """Means over scenes, as the headline says; LERF's row of the paper is macro, too."""
-    for row in published("lerf-ovs-loc"):
+    for row in find_published("lerf-ovs-loc"):
         if row.scenes:
             assert sum(row.scenes.values()) / 4 == pytest.approx(row.figures["located"], abs=6e-4), row.system
 
@@ -78,18 +78,18 @@ def test_every_profile_can_be_made_and_names_published_figures():
         assert profile.name == name
         assert profile.headline
         assert profile.differences
-        for row in published(name):
+        for row in find_published(name):
             assert set(row.figures) & {*profile.headline, *(f"micro_{one}" for one in profile.headline)} or row.kind
     with pytest.raises(InputError, match="does not exist"):
         find_profile("imagenet")
 
 
 def test_methods():
-    names = [method.name for method in methods()]
+    names = [method.name for method in list_methods()]
     assert len(set(names)) == len(names)
     assert {"weighted", "center", "2d"} <= set(names)
-    assert all(method.about and method.kind in METHOD_KINDS for method in methods())
-    for method in methods():
+    assert all(method.about and method.kind in METHOD_KINDS for method in list_methods())
+    for method in list_methods():
         if method.kind != "images":
             assert callable(method.lifting())
     with pytest.raises(InputError, match="lifts nothing"):
@@ -97,3 +97,11 @@ def test_methods():
     with pytest.raises(InputError, match="does not exist"):
         find_method("magic")
     assert Method("x", "y", make="math:sqrt").kind == "rival"
+
+
+def test_the_command_offers_every_profile():
+    from typing import get_args, get_type_hints
+
+    from sgwarp.commands.evaluate import Evaluate
+
+    assert get_args(get_args(get_type_hints(Evaluate, include_extras=True)["profile"])[0]) == tuple(PLACES)

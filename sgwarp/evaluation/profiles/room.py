@@ -9,12 +9,14 @@ import torch
 from torch import Tensor
 
 from sgwarp.datasets.base import resize_nearest
-from sgwarp.evaluation.answers import Answers
+from sgwarp.evaluation.answers import Answers, askable
 from sgwarp.evaluation.cases import Case
 from sgwarp.evaluation.profiles.base import Profile, add_confusion, total_of_values, total_pooled
 from sgwarp.evaluation.results import SceneResult
 from sgwarp.evaluation.sheets import draw_labels, photograph_of
+from sgwarp.lifting.residuals import residual
 from sgwarp.metrics.localization import hits_mask
+from sgwarp.metrics.overlap import mean
 from sgwarp.metrics.segmentation import ConfusionMatrix
 from sgwarp.querying.scores import class_votes
 from sgwarp.querying.scoring import score_texts
@@ -45,6 +47,7 @@ def score_room(case: Case, result: SceneResult, sheets: Path) -> None:
         result.values["located"] = hits
         result.figures["located"] = sum(hits) / len(hits) if hits else float("nan")
         result.figures |= _of_gaussians(case)
+        result.figures["held_out_residual"] = held_out_residual(case)
     for name in ("coverage", "residual"):
         if name in case.log.error:
             result.figures[name] = case.log.error[name]
@@ -53,18 +56,34 @@ def score_room(case: Case, result: SceneResult, sheets: Path) -> None:
 def _locate(case: Case, truths: dict[str, Tensor]) -> list[float]:
     """Whether the best pixel of each class lies on it, in each scored view that shows it."""
     hits = []
+    asked = askable(case.semantics[0], case.scene.classes)
     with case.log.stage("locate"):
         options = {"predicted": case.predicted, "ensemble": case.settings.ensemble}
-        scores = score_texts(case.semantics[0], case.scene.classes, case.text, **options)  # type: ignore[arg-type]
+        scores = score_texts(case.semantics[0], asked, case.text, **options)  # type: ignore[arg-type]
         for view in case.scored:
-            mean, known = splat_scores(case.gaussians, view.camera, scores.values, scores.seen)
-            for channel in range(len(case.scene.classes)):
-                mask = truths[view.stem] == channel
+            shown, known = splat_scores(case.gaussians, view.camera, scores.values, scores.seen)
+            for channel, name in enumerate(asked):
+                mask = truths[view.stem] == case.scene.classes.index(name)
                 if int(mask.sum()) >= SMALLEST:
-                    smooth = torch.where(known, box_mean(mean[..., channel], known, BOX), -torch.inf).cpu()
+                    smooth = torch.where(known, box_mean(shown[..., channel], known, BOX), -torch.inf).cpu()
                     y, x = divmod(int(smooth.argmax()), view.camera.width)
                     hits.append(float(hits_mask((x, y), mask)))
     return hits
+
+
+def held_out_residual(case: Case) -> float:
+    """How far the lifted features, rendered into the scored views, miss the 2D maps of those: see `residual`."""
+    if not case.sources:
+        return float("nan")
+    semantics, source, missed = case.semantics[0], case.sources[0], []
+    for view in case.scored:
+        image = photograph_of(case.gaussians, view) if source.needs_image else None
+        with case.log.stage("encode"):
+            found = source.encode(view, image)
+        with case.log.stage("residual"):
+            seen = semantics.seen.to(torch.float32)
+            missed.append(residual(case.gaussians, view.camera, found, semantics.features.float(), seen))
+    return mean(missed)
 
 
 def _of_gaussians(case: Case) -> dict[str, float]:
@@ -73,8 +92,11 @@ def _of_gaussians(case: Case) -> dict[str, float]:
     if column is None:
         return {}
     truth = torch.as_tensor(column).long()
-    votes = class_votes(case.semantics[0], case.scene.classes, case.text, scoring=case.settings.scoring)
-    best, channel = votes.cpu().max(dim=1)
+    options = {"predicted": case.predicted, "ensemble": case.settings.ensemble, "scoring": case.settings.scoring}
+    asked = askable(case.semantics[0], case.scene.classes)
+    votes = class_votes(case.semantics[0], asked, case.text, **options)  # type: ignore[arg-type]
+    best, column = votes.cpu().max(dim=1)
+    channel = torch.tensor([case.scene.classes.index(name) for name in asked])[column]
     known = (truth >= 0) & (truth < len(case.scene.classes))
     right = (channel == truth) & (best > 0)
     return {"accuracy_3d": float(right[known].float().mean()) if bool(known.any()) else float("nan")}
