@@ -132,6 +132,8 @@ class Viewer:
         session = Session(self, client)
         with self._lock:
             self._sessions[client.client_id] = session
+        if client.client_id not in self.server.get_clients():  # it left while its panel was built
+            self._disconnect(client)
 
     def _disconnect(self, client: Any) -> None:
         with self._lock:
