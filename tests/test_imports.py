@@ -27,6 +27,7 @@ COMMANDS = (
     "instances",
     "edit",
     "batch",
+    "view",
 )
 
 

@@ -4,9 +4,13 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from sgwarp.commands.options import Options, check_folder
 from sgwarp.runs.progress import show_progress
+
+if TYPE_CHECKING:
+    from sgwarp.viewer.live import Live
 
 
 @dataclass(kw_only=True)
@@ -16,9 +20,34 @@ class Demo(Options):
     out: Path = Path("demo_out")
     """Folder for the pictures, report.md and run.json."""
 
+    view: bool = False
+    """Show the room in the browser while it is lifted, and the result until Ctrl-C."""
+
     def run(self) -> None:
         check_folder("--out", self.out)
         self.start()
         from sgwarp.demo.run import run_demo
 
-        run_demo(self.out, device=self.device, show=show_progress)
+        if not self.view:
+            run_demo(self.out, device=self.device, show=show_progress)
+            return
+        live = self._live()
+        try:
+            run_demo(self.out, device=self.device, show=show_progress, watch=live.watch)
+            live.finish()
+        finally:
+            live.close()
+
+    def _live(self) -> Live:
+        from sgwarp.demo.data import Room
+        from sgwarp.demo.run import ENCODER
+        from sgwarp.encoders.registry import make_text_encoder
+        from sgwarp.viewer.live import Live
+        from sgwarp.viewer.workbench import Materials, Workbench
+
+        room = Room.load().to(self.device)
+        text = make_text_encoder(ENCODER, self.device)
+        return Live(
+            lambda semantics: Workbench(Materials(room.gaussians, semantics, None, text, views=room.views)),
+            Workbench.replace_semantics,
+        )

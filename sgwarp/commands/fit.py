@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import logging
 import math
+from contextlib import ExitStack
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
@@ -21,6 +22,7 @@ if TYPE_CHECKING:
     from sgwarp.reconstruction.fitting.trainer import Fitted
     from sgwarp.runs.log import RunLog
     from sgwarp.scene import View
+    from sgwarp.viewer.live import Live
 
 logger = logging.getLogger("sgwarp")
 DEGREE_EVERY = 1000  # steps between two rises of the degree of the colours
@@ -107,7 +109,17 @@ class Fit(Options):
     images: str | None = None
     """Name of a COLMAP model's folder of photographs, if it is not `images` nor the only one that holds them."""
 
+    view: bool = False
+    """Show the scene in the browser while it is fitted, and the result until Ctrl-C."""
+
     def run(self) -> None:
+        with ExitStack() as stack:
+            live = self._run(stack)
+            if live is not None:
+                live.finish()
+
+    def _run(self, stack: ExitStack) -> Live | None:
+        """Fit and write; the viewer that shows it, if one was asked for, closes with the stack."""
         from sgwarp.io.points import PLY_NAMES
 
         check_name("--out", self.out, ".ply")
@@ -141,6 +153,10 @@ class Fit(Options):
             masks = self._masks(views)
             start = self._start(source, kept, settings, log)
             checkpoint = self.out.with_name(f"{self.out.name}.checkpoint")
+            live = self._live(kept) if self.view else None
+            if live is not None:
+                stack.callback(live.close)
+                log.watch = live.watch
             with show_progress("fit") as progress:
                 fitted = fit(
                     kept,
@@ -163,6 +179,15 @@ class Fit(Options):
                 checkpoint.unlink(missing_ok=True)
         if not fitted.complete:
             raise KeyboardInterrupt
+        return live
+
+    @staticmethod
+    def _live(views: list[View]) -> Live:
+        """A viewer that opens with the scene that the fit starts from."""
+        from sgwarp.viewer.live import Live
+        from sgwarp.viewer.workbench import Materials, Workbench
+
+        return Live(lambda gaussians: Workbench(Materials(gaussians, views=views)), Workbench.replace_scene)
 
     def _masks(self, views: list[View]) -> Masks | None:
         """Masks that were given, or that the data set names."""

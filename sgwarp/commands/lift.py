@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from contextlib import ExitStack
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
@@ -12,6 +13,8 @@ from sgwarp.runs.progress import show_progress
 if TYPE_CHECKING:
     from sgwarp.runs.log import RunLog
     from sgwarp.scene import Gaussians, Semantics, View
+    from sgwarp.viewer.live import Live
+    from sgwarp.viewer.workbench import Workbench
 
 
 @dataclass(kw_only=True)
@@ -76,8 +79,19 @@ class Lift(SceneOptions):
     images: str | None = None
     """Name of a COLMAP model's folder of photographs, if it is not `images` nor the only one that holds them."""
 
+    view: bool = False
+    """Show the scene in the browser while it is lifted, and the result until Ctrl-C."""
+
     def run(self) -> None:
         check_name("--out", self.out, ".safetensors")
+        with ExitStack() as stack:
+            live = self._run(stack)
+            if live is not None:
+                live.finish()
+
+    def _run(self, stack: ExitStack) -> Live | None:
+        """Lift and write; the viewer that shows it, if one was asked for, closes with the stack."""
+        live = None
         with self.logged(self.out.parent) as log:
             from sgwarp.encoders.names import parse
             from sgwarp.io.store import save_semantics
@@ -94,11 +108,16 @@ class Lift(SceneOptions):
                 views = find_views(self.views, photographs=self.photographs, images=self.images)
                 with log.stage("compare"):
                     views = place_views(gaussians, self.scene, views, self.transform)
+                if self.view:
+                    live = self._live(gaussians, views)
+                    stack.callback(live.close)
+                    log.watch = live.watch
                 semantics = self._lift(gaussians, views, log)
                 notes = {"encoder": self.encoder, "mode": self.mode, "views": len(views)}
             with log.stage("write"):
                 save_semantics(semantics, self.out, notes)
             log.outputs.append(str(self.out))
+        return live
 
     def _lift(self, gaussians: Gaussians, views: list[View], log: RunLog) -> Semantics:
         from sgwarp.encoders.cache import CachedMaps, default_folder
@@ -126,3 +145,15 @@ class Lift(SceneOptions):
         if isinstance(source, CachedMaps):
             log.leave_out("views_encoded_before", source.hits)
         return semantics
+
+    def _live(self, gaussians: Gaussians, views: list[View]) -> Live:
+        """A viewer that opens with the first view's semantics; asks in words where the encoder has a text side."""
+        from sgwarp.encoders.registry import make_text_encoder
+        from sgwarp.viewer.live import Live
+        from sgwarp.viewer.workbench import Materials, Workbench
+
+        def begin(semantics: Semantics) -> Workbench:
+            text = None if semantics.labels is not None else make_text_encoder(self.encoder, self.device)
+            return Workbench(Materials(gaussians, semantics, None, text, views=views))
+
+        return Live(begin, Workbench.replace_semantics)

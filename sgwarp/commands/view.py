@@ -42,6 +42,9 @@ class View(SceneOptions):
     encoder: str | None = None
     """Encoder of the phrases; if not given, the one that the semantics were lifted with."""
 
+    min_weight: float = 0.0
+    """Gaussians with a smaller weight have no say, as if no view had seen them: 1 is one pixel filled by it alone."""
+
     host: str = "127.0.0.1"
     """Address to listen at. Any but the default lets other machines in; the printed link then holds a token."""
 
@@ -73,7 +76,9 @@ class View(SceneOptions):
             gaussians = sequence.frame(0).gaussians.to(self.device)
             if not len(gaussians):
                 raise InputError(f"{self.scene}: its first frame holds no Gaussians")
-        semantics = None if self.semantics is None else load_on(self.semantics, gaussians)
+        semantics = None
+        if self.semantics is not None:
+            semantics = load_on(self.semantics, gaussians).without_faint(self.min_weight)
         predicted = None if self.predicted is None else load_on(self.predicted, gaussians)
         if semantics is None and predicted is not None:
             raise InputError("--predicted: needs --semantics, what `sgwarp lift` wrote for this scene")

@@ -26,7 +26,7 @@ from sgwarp.errors import InputError
 from sgwarp.lifting.lifter import lift
 from sgwarp.ops.launcher import get_threads, set_threads
 from sgwarp.ops.splatting.forward import rasterize
-from sgwarp.runs.log import RunLog
+from sgwarp.runs.log import RunLog, Watch, ignore
 from sgwarp.runs.progress import ShowProgress, hide_progress
 from sgwarp.scene import FeatureMap, View
 
@@ -41,7 +41,13 @@ PICTURES = {
 }
 
 
-def run_demo(out: Path, threads: int | None = None, device: str = "cpu", show: ShowProgress = hide_progress) -> RunLog:
+def run_demo(
+    out: Path,
+    threads: int | None = None,
+    device: str = "cpu",
+    show: ShowProgress = hide_progress,
+    watch: Watch = ignore,
+) -> RunLog:
     """Lift the default encoder's semantics into the room, ask for its furniture, measure, draw and report.
 
     Writes the PICTURES, report.md and run.json, and prints the report.
@@ -51,6 +57,7 @@ def run_demo(out: Path, threads: int | None = None, device: str = "cpu", show: S
         threads: Host threads; all cores if None.
         device: Where to compute.
         show: Shows the progress of its stages.
+        watch: Is given the semantics as they grow, see RunLog.
 
     Returns:
         The log as written; its `error` holds `miou` (of the furniture), `localised` (of 11 objects), `coverage` and
@@ -70,14 +77,14 @@ def run_demo(out: Path, threads: int | None = None, device: str = "cpu", show: S
     # layer, which on a busy machine takes longer than the layer.
     torch.set_num_threads(1)
     try:
-        return _run(out, device, show)
+        return _run(out, RunLog(command="sgwarp demo", device=device, threads=get_threads(), show=show, watch=watch))
     finally:
         set_threads(threads_before[0])
         torch.set_num_threads(threads_before[1])
 
 
-def _run(out: Path, device: str, show: ShowProgress) -> RunLog:
-    log = RunLog(command="sgwarp demo", device=device, threads=get_threads(), show=show)
+def _run(out: Path, log: RunLog) -> RunLog:
+    device = log.device
     with log.stage("read"):
         room = Room.load().to(device)
     with log.stage("load_encoder"):

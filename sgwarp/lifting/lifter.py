@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
+from functools import partial
 
 import torch
 from torch import Tensor
@@ -105,6 +106,8 @@ def lift(
         lifting = _Lifting(reader, mode, chosen_settings, deterministic, progress, mapped)
         semantics = lifting.run(len(chosen))
     log.error["coverage"] = semantics.coverage
+    finished = semantics
+    log.watch(lambda: finished)
     if chosen_settings.fill:
         with log.stage("fill"):
             semantics = fill_holes(gaussians, semantics, chosen_settings.fill)
@@ -155,6 +158,8 @@ class _Lifting:
         for number, view in enumerate(self.views, start=1):
             sums = self._add_view(view, sums, number == len(self.views) and not self.worth)
             self._done(view.stem)
+            if sums is not None:
+                self.reader.log.watch(partial(self._so_far, sums))
         if sums is None:
             raise InputError(f"no feature map for any of the {views} views; file names must match the view stems")
         return sums
@@ -191,6 +196,10 @@ class _Lifting:
             sums.slices.add_(one.slices, alpha=worth)
             sums.weight.add_(one.weight, alpha=worth)
             sums.weight_squared.add_(one.weight_squared, alpha=worth * worth)
+
+    def _so_far(self, sums: LiftSums) -> Semantics:
+        """The weighted mean of the views so far; leaves the sums as they are."""
+        return self._mean(replace(sums, slices=sums.slices.clone(), weight=sums.weight.clone()))
 
     def _mean(self, sums: LiftSums) -> Semantics:
         """The weighted mean; overwrites the sums."""

@@ -5,14 +5,21 @@ from __future__ import annotations
 import json
 import math
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
+from typing import Any
 
 from sgwarp.files.atomic import atomic_path
 from sgwarp.runs.progress import ShowProgress, hide_progress
 from sgwarp.version import __version__
+
+Watch = Callable[[Callable[[], Any]], None]
+
+
+def ignore(make: Callable[[], Any]) -> None:
+    """Watch nothing."""
 
 
 @dataclass
@@ -29,6 +36,8 @@ class RunLog:
         error: The run's own error figures.
         outputs: Files written.
         curve: How a run that improves step by step got there, one row of numbers per measurement; else left out.
+        watch: Is given what makes a copy of the run's result so far, each time that it has grown; does nothing by
+            default. Not written.
         show: Shows the progress of a stage, as `with log.show(title) as report`; nothing by default. Not written.
     """
 
@@ -42,6 +51,7 @@ class RunLog:
     outputs: list[str] = field(default_factory=list)
     curve: list[dict[str, float]] = field(default_factory=list)
     show: ShowProgress = field(default=hide_progress, repr=False)
+    watch: Watch = field(default=ignore, repr=False)
 
     @contextmanager
     def stage(self, name: str, wait: bool = True) -> Iterator[None]:
@@ -67,8 +77,8 @@ class RunLog:
 
     def write(self, folder: Path) -> Path:
         """Write `run.json` into `folder`, whole or not at all; numbers that are not finite become null."""
-        record = asdict(self)
-        del record["show"]
+        record = asdict(replace(self, show=hide_progress, watch=ignore))  # asdict copies whatever they belong to
+        del record["show"], record["watch"]
         record["stages"] = {name: round(seconds, 4) for name, seconds in self.stages.items()}
         record["error"] = _finite(self.error)
         record["curve"] = [_finite(row) for row in self.curve]

@@ -10,6 +10,7 @@ GOAL = 1 / 24  # seconds for a picture while the camera moves
 SLOWEST = 1 / 15  # above which the next picture is smaller
 SIZES = (96, 128, 192, 256, 360, 480, 600, 720, 900, 1080)  # heights of moving pictures [pixels]
 STILL = 0.15  # seconds without a move after which a camera stands still
+SURPRISE = 2.0  # times the slowest picture that a single one counts as, at most
 MEMORY = 0.7  # of the measured times
 BOLD = 0.8  # share of the goal that the next larger picture is expected to take, before it is tried
 
@@ -39,6 +40,7 @@ class Pace:
             height: Of the picture, which may be less than wanted where the page is small.
         """
         known = self.seconds > 0
+        seconds = min(seconds, SURPRISE * SLOWEST)  # the first one of a mode compiles its kernels
         self.seconds = MEMORY * self.seconds + (1 - MEMORY) * seconds if known else seconds
         if self.seconds > SLOWEST and self.place > 0:
             self._go_to(self.place - 1)

@@ -166,7 +166,10 @@ class Panel:
         self._typing.start()
 
     def _ask(self) -> None:
-        self.tab.ask(self._query.value, self._negatives.value, self._templates.value, self._ensemble.value)
+        answers = self.tab.ask(self._query.value, self._negatives.value, self._templates.value, self._ensemble.value)
+        if answers is not None and answers.unknown:
+            names = ", ".join(answers.unknown)
+            self.tell(f"the encoder knows nothing like {names}; choose other words", wrong=True)
 
     def _take_picture(self, data: bytes) -> None:
         name = self.tab.add_picture(data)

@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import torch
 from torch import Tensor
 
 from sgwarp.encoders.base import TextEncoder
+from sgwarp.encoders.calibration import Calibration, calibration_of
 from sgwarp.encoders.prompts import TEMPLATE_SETS, fill_templates
 from sgwarp.errors import InputError
 from sgwarp.querying.ensembles import Ensemble
@@ -82,9 +83,13 @@ class Answers:
     def carried(self, rows: Tensor) -> TextScores:
         """The scores of a scene whose Gaussians come from these rows."""
         evidence = None if self.scores.evidence is None else self.scores.evidence[rows]
-        return TextScores(
-            self.scores.values[rows], evidence, self.scores.level, self.scores.seen[rows], self.scores.known
-        )
+        return replace(self.scores, values=self.scores.values[rows], evidence=evidence, seen=self.scores.seen[rows])
+
+    @property
+    def unknown(self) -> tuple[str, ...]:
+        """Queries that mean nothing to the encoder."""
+        known = self.scores.known.tolist()
+        return tuple(text for text, means in zip(self.questions.queries, known, strict=True) if not means)
 
     def histogram(self, query: int = 0) -> tuple[Tensor, Tensor]:
         """How many seen Gaussians score how much: centers of the bins, float64 [40], and counts, float64 [40]."""
@@ -142,7 +147,7 @@ class Asker:
             raise InputError("query: is empty; write what to look for, such as couch; lamp")
         encoder = self._encoder(questions.templates)
         if encoder is not None and pictures:
-            encoder = WithPictures(encoder, pictures, encoder.space)
+            encoder = WithPictures(encoder, pictures, encoder.space, calibration_of(encoder))
         options = {"measure": "relevancy", "canonical": questions.negatives} if questions.negatives else {}
         scores = score_texts(
             self.semantics,
@@ -192,6 +197,7 @@ class WithPictures:
     encoder: TextEncoder
     pictures: Mapping[str, Tensor]
     space: str
+    calibration: Calibration
 
     def encode_text(self, texts: Sequence[str]) -> Tensor:
         """Unit vectors of phrases and pictures, float32 [Q, C]."""

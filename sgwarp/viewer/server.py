@@ -66,7 +66,7 @@ class Viewer:
 
     def __init__(self, bench: Workbench, address: Address | None = None) -> None:
         self.bench, self.address = bench, address or Address()
-        viser = _require_viser()
+        viser = require_viser()
         port = _free_port(self.address.host, self.address.port)
         hosts = LOOPBACK if self.address.host in LOOPBACK else ()
         with _quiet(), gated(Gate(hosts, self.address.token)):
@@ -132,6 +132,8 @@ class Viewer:
         session = Session(self, client)
         with self._lock:
             self._sessions[client.client_id] = session
+        if client.client_id not in self.server.get_clients():  # it left while its panel was built
+            self._disconnect(client)
 
     def _disconnect(self, client: Any) -> None:
         with self._lock:
@@ -265,7 +267,12 @@ def _fov(view: View) -> float:
     return 2 * math.atan(view.camera.height / (2 * float(view.camera.K[1, 1])))
 
 
-def _require_viser() -> Any:
+def require_viser() -> Any:
+    """The module viser.
+
+    Raises:
+        InputError: It is not installed.
+    """
     try:
         import viser
     except ImportError:

@@ -60,7 +60,7 @@ class Page:
     def __init__(self, browser, viewer: Viewer) -> None:
         before = set(viewer.tabs)
         self.page = browser.new_page(viewport={"width": 760, "height": 480}, accept_downloads=True)
-        self.page.goto(viewer.url)
+        self.page.goto(f"{viewer.url}?fixedDpr=1")  # else the page draws at a lower resolution where it is slow
         self.page.add_style_tag(content=".mantine-Notifications-root { display: none }")  # they lie over the canvas
         self.session = until(lambda: next(iter(set(viewer.tabs) - before), None), "the tab")
         first = viewer.bench.materials.views[0].camera.position

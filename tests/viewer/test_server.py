@@ -183,6 +183,7 @@ def test_a_client_cannot_set_what_is_no_value(make_viewer):
     box = client.wait_for_query_box()
     client.send("GuiUpdateMessage", uuid=box, updates={"update_cb": [], "removed": True})
     client.send("GuiUpdateMessage", uuid=box, updates={"value": "lamp"})
+    assert _until(lambda: viewer.tabs)
     (session,) = viewer.tabs
     assert _until(lambda: session.tab.answers is not None)
     assert session.tab.answers.questions.queries == ("lamp",)
@@ -196,6 +197,7 @@ def test_a_refused_value_is_told_and_changes_nothing(make_viewer):
     client.send("GuiUpdateMessage", uuid=box, updates={"value": ";".join(map(str, range(99)))})
     told = client.wait_for("NotificationShowMessage")
     assert "at most 16 phrases" in str(told)
+    assert _until(lambda: viewer.tabs)
     (session,) = viewer.tabs
     assert session.tab.answers is None
 
@@ -206,7 +208,7 @@ def test_tabs_come_and_go(make_viewer):
     for client in clients:
         client.look()
         picture(client)
-    assert len(viewer.tabs) == 3
+    assert _until(lambda: len(viewer.tabs) == 3)
     assert len({id(session.tab) for session in viewer.tabs}) == 3
     for client in clients[:2]:
         client.socket.close()

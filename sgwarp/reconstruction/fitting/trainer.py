@@ -142,8 +142,13 @@ def fit(
             first = _starting(start, photographs, shown, frame, settings, report, device)
             report_start(photographs, first.means, frame)
             run.begin(first)
+
+    def tell(done: int, total: int, text: str) -> None:
+        report(done, total, text)
+        log.watch(lambda: frame.restored(run.model.gaussians()))
+
     with deferred_interrupt() as interrupted:
-        complete = run.go(report, path, checkpoint_every, interrupted)
+        complete = run.go(tell, path, checkpoint_every, interrupted)
     if path is not None:
         run.try_to_save(path)
     if complete:
@@ -155,7 +160,9 @@ def fit(
     fitted_to = tuple(view for view in views if view.stem in used)
     if settings.refine_poses:
         fitted_to = tuple(frame.with_pose(view, used[view.stem]) for view in fitted_to)
-    return Fitted(frame.restored(run.model.gaussians()), run.curve, measured, on_fitted, complete, fitted_to)
+    result = frame.restored(run.model.gaussians())
+    log.watch(lambda: result)
+    return Fitted(result, run.curve, measured, on_fitted, complete, fitted_to)
 
 
 def _starting(
