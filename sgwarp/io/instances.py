@@ -21,7 +21,7 @@ from torch import Tensor
 from sgwarp.errors import InputError
 from sgwarp.files.atomic import atomic_path
 from sgwarp.files.documents import parse_json
-from sgwarp.files.tensors import read_tensors
+from sgwarp.files.tensors import read_tensors, write_tensors
 from sgwarp.io.ply import write_ply
 from sgwarp.scene import Gaussians, Instance, InstanceMap
 
@@ -42,8 +42,6 @@ def save_instances(found: InstanceMap, path: str | os.PathLike[str], notes: Mapp
     Raises:
         InputError: Wrong name, or notes that are not JSON.
     """
-    from safetensors.torch import save_file
-
     if Path(path).suffix != ".safetensors":
         raise InputError(f"{path}: instances are written as .safetensors; change the name")
     kind = torch.int16 if len(found.table) <= SHORT else torch.int32
@@ -68,8 +66,7 @@ def save_instances(found: InstanceMap, path: str | os.PathLike[str], notes: Mapp
         "table": json.dumps([asdict(row) for row in found.table]),
         "notes": stored_notes,
     }
-    with atomic_path(path) as temporary:
-        save_file(tensors, temporary, metadata=metadata)
+    write_tensors(path, tensors, metadata)
 
 
 def load_instances(path: str | os.PathLike[str], gaussians: Gaussians | None = None) -> InstanceMap:
