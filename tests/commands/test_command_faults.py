@@ -1,4 +1,4 @@
-"""Faults under whole commands: a disk without room, a folder that refuses, two runs of one output, a stop in between."""
+"""Faults under whole commands: a disk without room, a folder that refuses, two runs of one output, a stop."""
 
 import json
 import os
