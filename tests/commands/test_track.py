@@ -369,6 +369,31 @@ def test_nan_and_a_jump_in_one_frame_cost_that_frame_alone(files, tmp_path):
     assert track_other(scene, files, tmp_path / "fused", "--frames", "4") == 0
 
 
+def test_a_still_frame_is_answered_as_the_one_before(files, tmp_path):
+    """Frames 1 and 2 show the scene of frame 0 with its labels: the same answers, and none is asked for twice."""
+
+    def hold(arrays):
+        for name in ("means3D", "unnorm_rotations", "rgb_colors"):
+            arrays[name][1:3] = arrays[name][0]
+
+    scene = changed_params(files, tmp_path, hold)
+    labels = tmp_path / "labels"
+    shutil.copytree(files / "labels", labels)
+    for frame in (1, 2):
+        shutil.rmtree(labels / f"{frame:05d}")
+        shutil.copytree(labels / "00000", labels / f"{frame:05d}")
+    options = ["--frames", "4", "--forgetting", "0", "--encoder", f"files:{labels}"]
+    assert track_other(scene, files, tmp_path / "out", *options) == 0
+    for stem in ("0", "1", "2"):
+        first, second, third, other = (tmp_path / "out" / f"{frame:05d}" / f"{stem}.png" for frame in range(4))
+        assert first.read_bytes() == second.read_bytes() == third.read_bytes() != other.read_bytes()
+    run = json.loads((tmp_path / "out" / "run.json").read_text())
+    assert run["left_out"]["answers_that_did_not_change"] == 2
+    rows = [json.loads((tmp_path / "out" / f"{frame:05d}" / "frame.json").read_text()) for frame in range(3)]
+    assert (rows[1]["left_out"], rows[1]["changed_object"]) == (1.0, 0)
+    assert rows[0]["objects"] == rows[1]["objects"] == rows[2]["objects"]
+
+
 def test_frames_without_gaussians_and_counts_that_change(files, tmp_path, capsys):
     scene = make_moving_scene(0, FRAMES, 2500, cameras=4, width=64, height=48, moving_share=0.5)
     folder = tmp_path / "ply"

@@ -52,6 +52,15 @@ class Output:
     settings: dict[str, Any] = field(default_factory=dict)
 
 
+@dataclass(frozen=True, eq=False)
+class _Told:
+    """A frame, what was answered, and of which views."""
+
+    tracked: TrackedFrame
+    answer: Answer
+    asked: list[FrameView]
+
+
 def run_tracking(
     sequence: GaussianSequence,
     views: MovingViews,
@@ -80,10 +89,12 @@ def run_tracking(
         if store is not None:
             store.resume(first - 1)
     report(first, total, "")
+    last: _Told | None = None
     started = time.perf_counter()
     with deferred_interrupt() as interrupted:
         for index in range(first, total):
-            tracked, channels = _one(sequence, views, tracker, questions, output, index, channels)
+            last = _one(sequence, views, tracker, questions, output, index, channels, last)
+            tracked, channels = last.tracked, last.answer.channels.cpu()
             if store is not None:
                 with log.stage("write"):
                     store.write(tracked)
@@ -107,8 +118,9 @@ def _one(
     output: Output,
     index: int,
     before: Tensor,
-) -> tuple[TrackedFrame, Tensor]:
-    """Track one frame and write its folder."""
+    last: _Told | None,
+) -> _Told:
+    """Track one frame and write its folder; a frame in which nothing changed is answered as the one before."""
     log = tracker.log
     with log.stage("read"):
         frame = sequence.frame(index)
@@ -116,10 +128,24 @@ def _one(
     tracked = tracker.step(frame, shown)
     asked = shown if output.masks is None else views_at(output.masks, index)
     with log.stage("ask"):
-        found = answer(tracked, questions, [view.view for view in asked])
+        if last is not None and tracked.unchanged and _same_cameras(asked, last.asked):
+            found = last.answer
+            log.leave_out("answers_that_did_not_change")
+        else:
+            found = answer(tracked, questions, [view.view for view in asked])
     with log.stage("write"):
         _write(output, tracked, found, asked, before)
-    return tracked, found.channels.cpu()
+    return _Told(tracked, found, asked)
+
+
+def _same_cameras(asked: list[FrameView], before: list[FrameView]) -> bool:
+    """Whether the same views look from the same places."""
+    return len(asked) == len(before) and all(
+        (one.view.stem, one.view.camera.size) == (other.view.stem, other.view.camera.size)
+        and torch.equal(one.view.camera.K, other.view.camera.K)
+        and torch.equal(one.view.camera.world_to_camera, other.view.camera.world_to_camera)
+        for one, other in zip(asked, before, strict=True)
+    )
 
 
 def _write(output: Output, tracked: TrackedFrame, found: Answer, asked: list[FrameView], before: Tensor) -> None:
