@@ -11,14 +11,19 @@ import pytest
 import torch
 
 from sgwarp.apps.tracking import run as tracking_run
+from sgwarp.apps.tracking.answers import Questions
 from sgwarp.apps.tracking.association import Associated
+from sgwarp.apps.tracking.sources import LabelFrames
 from sgwarp.apps.tracking.state import read_features
+from sgwarp.apps.tracking.tracker import Tracker, track
 from sgwarp.cli import main
 from sgwarp.datasets.moving import LABELS, make_moving_scene
 from sgwarp.datasets.moving_files import save_moving_scene
 from sgwarp.errors import InputError
 from sgwarp.files.images import read_ids, read_rgb
+from sgwarp.io.moving_views import load_moving_views
 from sgwarp.io.scenes import save_gaussians
+from sgwarp.io.sequences import load_sequence
 from sgwarp.scene import FeatureMap
 
 FRAMES = 6
@@ -102,11 +107,6 @@ def test_pictures(files, tracked, tmp_path):
 
 def test_stored_features_are_those_of_the_frame(files, tracked):
     """What was left out differs by less than a hundredth of a row's length, and is less than everything."""
-    from sgwarp.apps.tracking.sources import LabelFrames
-    from sgwarp.apps.tracking.tracker import track
-    from sgwarp.io.moving_views import load_moving_views
-    from sgwarp.io.sequences import load_sequence
-
     for one in track(load_sequence(files), load_moving_views(files), LabelFrames(files / "labels")):
         stored = torch.from_numpy(read_features(tracked / "features", one.index)).float()
         wanted = torch.where(one.weight[:, None] > 0, one.features, 0.0)
@@ -188,6 +188,20 @@ def test_masks_of_cameras_that_were_not_lifted(files, tmp_path):
     truth = read_ids(files / "truth" / "00002" / "3.png")
     assert float((read_ids(tmp_path / "00002" / "3.png") == truth).mean()) > 0.7
     assert not (tmp_path / "00003").exists()
+
+
+def test_masks_are_those_of_the_cameras_of_their_frame(files, tmp_path):
+    asked = []
+
+    class Noted:
+        def at(self, frame):
+            asked.append(frame)
+            return views.at(frame)
+
+    views, source = load_moving_views(files), LabelFrames(files / "labels")
+    output = tracking_run.Output(tmp_path, Noted(), pictures=False)
+    tracking_run.run_tracking(load_sequence(files), views, Tracker(source), Questions(), output, frames=3)
+    assert asked == [0, 1, 2]
 
 
 def test_a_folder_of_ply_with_cameras_that_stay(files, tmp_path):

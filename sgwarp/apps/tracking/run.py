@@ -159,11 +159,18 @@ def _write(output: Output, tracked: TrackedFrame, found: Answer, asked: list[Fra
         picture = pictures.frame_picture(photographs, images, found.names, found.values, f"frame {tracked.index}")
         write_rgb(output.folder / "overlays" / f"{tracked.index:05d}.jpg", picture)
     now = found.channels.cpu()
-    changed = int(((now != before) & (now >= 0) & (before >= 0)).sum()) if len(now) == len(before) else None
-    row = {"frame": tracked.index, "objects": found.objects, "scores": found.scores, "changed_object": changed}
+    row = {"frame": tracked.index, "objects": found.objects, "scores": found.scores}
+    row |= {"changed_object": count_changes(before, now)}
     row |= {"views": [view.view.stem for view in asked], "left_out": round(tracked.work.left_out, 6)}
     with atomic_path(folder / FRAME_FILE) as temporary:
         temporary.write_text(json.dumps(row, allow_nan=False), encoding="utf-8")
+
+
+def count_changes(before: Tensor, now: Tensor) -> int | None:
+    """Gaussians that belong to another object than before, -1 for none [N]; None where their number changed."""
+    if len(now) != len(before):
+        return None
+    return int(((now != before) & (now >= 0) & (before >= 0)).sum())
 
 
 def _photograph(tracked: TrackedFrame, view: View) -> Any:

@@ -9,7 +9,7 @@ import torch
 from sgwarp.apps.tracking import pictures
 from sgwarp.apps.tracking.answers import Questions, answer, query_scores
 from sgwarp.apps.tracking.facts import sequence_facts
-from sgwarp.apps.tracking.run import gather
+from sgwarp.apps.tracking.run import count_changes, gather
 from sgwarp.apps.tracking.sources import LabelFrames
 from sgwarp.apps.tracking.tracker import TrackedFrame
 from sgwarp.errors import InputError
@@ -72,6 +72,12 @@ def test_what_nothing_saw_belongs_to_no_object(stage, toy_text):
     found = answer(one, Questions(classes=("wall", "left door", "lamp", "book"), encoder=toy_text), [])
     assert set(found.channels[stage.classes == 3].tolist()) == {-1}
     assert [row["gaussians"] > 0 for row in found.objects] == [True, True, False, True]
+
+
+def test_a_gaussian_changes_from_one_object_to_another_not_from_none():
+    before, now = torch.tensor([0, 1, -1, 2, -1]), torch.tensor([0, 2, 1, -1, -1])
+    assert count_changes(before, now) == 1
+    assert count_changes(before, now[:4]) is None
 
 
 def test_rows_become_tracks_in_the_order_of_the_ids():
