@@ -18,13 +18,14 @@ from sgwarp.apps.instances.association import (
 )
 from sgwarp.apps.instances.description import GroupFacts, _parents, find_doubts, oriented_box, quaternion
 from sgwarp.apps.instances.evidence import ViewEvidence, view_evidence
+from sgwarp.apps.instances.finder import mean_features
 from sgwarp.apps.instances.settings import InstanceSettings
 from sgwarp.apps.instances.view_agreement import agreement
 from sgwarp.encoders.masks.sources import ViewMasks
 from sgwarp.ops.reference import lifting as reference
 from sgwarp.ops.reference.rasterizer import rotation_matrices
 from sgwarp.ops.splatting.settings import RasterSettings
-from sgwarp.scene import Instance, View
+from sgwarp.scene import Instance, InstanceMap, Semantics, View
 
 EXACT = InstanceSettings(samples_per_mask=0)
 
@@ -278,3 +279,16 @@ def test_a_part_belongs_to_the_object_that_holds_half_of_it(inside, parent):
     )
     ids = {"s": np.ones(10, np.int64), "l": np.where(np.arange(10) < inside, 2, -1)}
     assert _parents(SimpleNamespace(levels=("s", "l"), table=table), ids).get(1, 0) == parent
+
+
+def test_mean_features_are_weighted_with_the_confidence():
+    """Nine votes of nine make 10/11, one of one 2/3; a Gaussian that nothing lifted does not count."""
+    zero = (0.0, 0.0, 0.0)
+    table = (Instance(1, "default", 0, 3, 1, 1, 1.0, zero, (1.0, 0.0, 0.0, 0.0), zero),)
+    ids = torch.ones(1, 3, 1, dtype=torch.int32)
+    found = InstanceMap(ids, torch.ones(1, 3, 1), torch.tensor([9.0, 1.0, 9.0]), table, ("default",), "x")
+    weight = torch.tensor([1.0, 1.0, 0.0])
+    semantics = Semantics(torch.eye(3), weight, weight, "toy", "x")
+    total = 10 / 11 + 2 / 3
+    mean = torch.tensor([[10 / 11 / total, 2 / 3 / total, 0.0]])
+    torch.testing.assert_close(mean_features(found, semantics), mean)

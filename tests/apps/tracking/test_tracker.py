@@ -235,6 +235,24 @@ def test_a_missing_photograph_leaves_its_view_out(scene):
     assert source.seen == [(0, "0")]
     assert tracker.log.left_out["views_without_photograph"] == 1
     assert tracker.log.left_out["photographs_rendered_instead"] == 1
+    source.needs_image = False  # label images do not ask for photographs
+    source.encode = lambda frame, view, image: FeatureMap("toy", dense=torch.ones(72, 96, 3))
+    tracker = Tracker(source, ALONE)
+    tracker.step(Recorded(scene).frame(0), views)
+    assert "views_without_photograph" not in tracker.log.left_out
+
+
+def test_pictures_rendered_instead_of_photographs_lie_between_0_and_1(scene):
+    class Bright:
+        space, needs_image = "toy", True
+
+        def encode(self, frame, view, image):
+            assert 0.0 <= float(image.min()) < float(image.max()) == 1.0
+            return FeatureMap("toy", dense=image)
+
+    frame = Recorded(scene).frame(0)
+    lit = replace(frame.gaussians, sh=10 * frame.gaussians.sh.abs())
+    Tracker(Bright(), ALONE).step(replace(frame, gaussians=lit), [FrameView(scene.cameras[0])])
 
 
 def test_counts_that_change_need_ids(scene, truth):
