@@ -177,6 +177,16 @@ def test_duplicate_adds_shifted_copies_at_the_end(half):
     assert change.rows[60:].tolist() == list(range(30))
 
 
+def test_gaussians_that_are_not_finite_do_not_move_the_centroid(half):
+    gaussians, chosen = half
+    means = gaussians.means.clone()
+    means[3] = math.nan
+    others = chosen.clone()
+    others[3] = False
+    found = ops.centroid(dataclasses.replace(gaussians, means=means), chosen)
+    torch.testing.assert_close(found, ops.centroid(gaussians, others), rtol=0, atol=1e-12)
+
+
 @pytest.mark.parametrize(
     ("content", "message"),
     [
@@ -427,6 +437,14 @@ def test_a_failing_step_changes_nothing(stage, context):
         edit(stage.gaussians, [], context)
     with pytest.raises(InputError, match="undo: no step"):
         EditSession(stage.gaussians).undo()
+
+
+def test_copies_are_numbered_in_the_order_they_were_made(stage, context):
+    steps = [EditStep(Selection((text,)), ops.Duplicate((0.0, 0.0, -1.0))) for text in ("lamp", "book")]
+    state = edit(stage.gaussians, steps, context)
+    for number, panel in ((1, 3), (2, 4)):
+        copy = pick(state, Selection((f"copy:{number}",)), context)
+        assert set(stage.classes[state.rows[copy]].tolist()) == {panel}
 
 
 def test_rows_lead_back_to_the_scene(stage, context):

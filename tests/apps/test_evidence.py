@@ -1,5 +1,8 @@
 """Evidence, association and counts against dense float64 formulas; boxes and agreement against closed forms."""
 
+import math
+from types import SimpleNamespace
+
 import numpy as np
 import pytest
 import torch
@@ -13,15 +16,16 @@ from sgwarp.apps.instances.association import (
     priorities,
     sampling_rates,
 )
-from sgwarp.apps.instances.description import oriented_box, quaternion
+from sgwarp.apps.instances.description import GroupFacts, _parents, find_doubts, oriented_box, quaternion
 from sgwarp.apps.instances.evidence import ViewEvidence, view_evidence
+from sgwarp.apps.instances.finder import mean_features
 from sgwarp.apps.instances.settings import InstanceSettings
 from sgwarp.apps.instances.view_agreement import agreement
 from sgwarp.encoders.masks.sources import ViewMasks
 from sgwarp.ops.reference import lifting as reference
 from sgwarp.ops.reference.rasterizer import rotation_matrices
 from sgwarp.ops.splatting.settings import RasterSettings
-from sgwarp.scene import View
+from sgwarp.scene import Instance, InstanceMap, Semantics, View
 
 EXACT = InstanceSettings(samples_per_mask=0)
 
@@ -249,3 +253,42 @@ def test_view_evidence_is_small(stage):
     found = ViewMasks.without_empty(many, torch.full((300,), -1))
     evidence = view_evidence(stage.gaussians, view, found, RasterSettings())
     assert len(evidence.gaussians) < 12 * len(stage.gaussians) < 300 * len(stage.gaussians)
+
+
+@pytest.mark.parametrize(("angle", "doubted"), [(0.0, True), (0.4, True), (0.5, False), (3.0, False)])
+def test_instances_that_may_be_one_look_alike(angle, doubted):
+    """Two side by side that no view compares, their features at an angle: cos 0.4 = 0.92, cos 0.5 = 0.88."""
+    table = [
+        Instance(k, "default", 0, 9, 1, 1, 1.0, (float(k), 0.0, 0.0), (1.0, 0.0, 0.0, 0.0), (1.0, 1.0, 1.0))
+        for k in (1, 2)
+    ]
+    once, no = np.ones(2, np.int64), np.zeros((2, 2), bool)
+    facts = [GroupFacts(once, once, no, no, ("", ""), np.ones(2))]
+    features = torch.tensor([[1.0, 0.0], [math.cos(angle), math.sin(angle)]])
+    found = find_doubts(table, facts, features)
+    assert [row.may_be for row in found] == ([(2,), (1,)] if doubted else [(), ()])
+    assert [row.may_be for row in find_doubts(table, facts, None)] == [(2,), (1,)]
+
+
+@pytest.mark.parametrize(("inside", "parent"), [(10, 2), (6, 2), (5, 2), (4, 0), (0, 0)])
+def test_a_part_belongs_to_the_object_that_holds_half_of_it(inside, parent):
+    """Of ten Gaussians of part 1 some are in object 2, the others in none."""
+    zero = (0.0, 0.0, 0.0)
+    table = tuple(
+        Instance(k, level, 0, 9, 1, 1, 1.0, zero, (1.0, 0.0, 0.0, 0.0), zero) for k, level in ((1, "s"), (2, "l"))
+    )
+    ids = {"s": np.ones(10, np.int64), "l": np.where(np.arange(10) < inside, 2, -1)}
+    assert _parents(SimpleNamespace(levels=("s", "l"), table=table), ids).get(1, 0) == parent
+
+
+def test_mean_features_are_weighted_with_the_confidence():
+    """Nine votes of nine make 10/11, one of one 2/3; a Gaussian that nothing lifted does not count."""
+    zero = (0.0, 0.0, 0.0)
+    table = (Instance(1, "default", 0, 3, 1, 1, 1.0, zero, (1.0, 0.0, 0.0, 0.0), zero),)
+    ids = torch.ones(1, 3, 1, dtype=torch.int32)
+    found = InstanceMap(ids, torch.ones(1, 3, 1), torch.tensor([9.0, 1.0, 9.0]), table, ("default",), "x")
+    weight = torch.tensor([1.0, 1.0, 0.0])
+    semantics = Semantics(torch.eye(3), weight, weight, "toy", "x")
+    total = 10 / 11 + 2 / 3
+    mean = torch.tensor([[10 / 11 / total, 2 / 3 / total, 0.0]])
+    torch.testing.assert_close(mean_features(found, semantics), mean)

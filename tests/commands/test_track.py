@@ -11,14 +11,19 @@ import pytest
 import torch
 
 from sgwarp.apps.tracking import run as tracking_run
+from sgwarp.apps.tracking.answers import Questions
 from sgwarp.apps.tracking.association import Associated
+from sgwarp.apps.tracking.sources import LabelFrames
 from sgwarp.apps.tracking.state import read_features
+from sgwarp.apps.tracking.tracker import Tracker, track
 from sgwarp.cli import main
 from sgwarp.datasets.moving import LABELS, make_moving_scene
 from sgwarp.datasets.moving_files import save_moving_scene
 from sgwarp.errors import InputError
 from sgwarp.files.images import read_ids, read_rgb
+from sgwarp.io.moving_views import load_moving_views
 from sgwarp.io.scenes import save_gaussians
+from sgwarp.io.sequences import load_sequence
 from sgwarp.scene import FeatureMap
 
 FRAMES = 6
@@ -102,11 +107,6 @@ def test_pictures(files, tracked, tmp_path):
 
 def test_stored_features_are_those_of_the_frame(files, tracked):
     """What was left out differs by less than a hundredth of a row's length, and is less than everything."""
-    from sgwarp.apps.tracking.sources import LabelFrames
-    from sgwarp.apps.tracking.tracker import track
-    from sgwarp.io.moving_views import load_moving_views
-    from sgwarp.io.sequences import load_sequence
-
     for one in track(load_sequence(files), load_moving_views(files), LabelFrames(files / "labels")):
         stored = torch.from_numpy(read_features(tracked / "features", one.index)).float()
         wanted = torch.where(one.weight[:, None] > 0, one.features, 0.0)
@@ -188,6 +188,20 @@ def test_masks_of_cameras_that_were_not_lifted(files, tmp_path):
     truth = read_ids(files / "truth" / "00002" / "3.png")
     assert float((read_ids(tmp_path / "00002" / "3.png") == truth).mean()) > 0.7
     assert not (tmp_path / "00003").exists()
+
+
+def test_masks_are_those_of_the_cameras_of_their_frame(files, tmp_path):
+    asked = []
+
+    class Noted:
+        def at(self, frame):
+            asked.append(frame)
+            return views.at(frame)
+
+    views, source = load_moving_views(files), LabelFrames(files / "labels")
+    output = tracking_run.Output(tmp_path, Noted(), pictures=False)
+    tracking_run.run_tracking(load_sequence(files), views, Tracker(source), Questions(), output, frames=3)
+    assert asked == [0, 1, 2]
 
 
 def test_a_folder_of_ply_with_cameras_that_stay(files, tmp_path):
@@ -367,6 +381,31 @@ def test_nan_and_a_jump_in_one_frame_cost_that_frame_alone(files, tmp_path):
     extents = [one["extent"] for one in row["objects"] if one["extent"]]
     assert np.abs(extents).max() < 10.0  # the one that jumped away is no part of an object's extent
     assert track_other(scene, files, tmp_path / "fused", "--frames", "4") == 0
+
+
+def test_a_still_frame_is_answered_as_the_one_before(files, tmp_path):
+    """Frames 1 and 2 show the scene of frame 0 with its labels: the same answers, and none is asked for twice."""
+
+    def hold(arrays):
+        for name in ("means3D", "unnorm_rotations", "rgb_colors"):
+            arrays[name][1:3] = arrays[name][0]
+
+    scene = changed_params(files, tmp_path, hold)
+    labels = tmp_path / "labels"
+    shutil.copytree(files / "labels", labels)
+    for frame in (1, 2):
+        shutil.rmtree(labels / f"{frame:05d}")
+        shutil.copytree(labels / "00000", labels / f"{frame:05d}")
+    options = ["--frames", "4", "--forgetting", "0", "--encoder", f"files:{labels}"]
+    assert track_other(scene, files, tmp_path / "out", *options) == 0
+    for stem in ("0", "1", "2"):
+        first, second, third, other = (tmp_path / "out" / f"{frame:05d}" / f"{stem}.png" for frame in range(4))
+        assert first.read_bytes() == second.read_bytes() == third.read_bytes() != other.read_bytes()
+    run = json.loads((tmp_path / "out" / "run.json").read_text())
+    assert run["left_out"]["answers_that_did_not_change"] == 2
+    rows = [json.loads((tmp_path / "out" / f"{frame:05d}" / "frame.json").read_text()) for frame in range(3)]
+    assert (rows[1]["left_out"], rows[1]["changed_object"]) == (1.0, 0)
+    assert rows[0]["objects"] == rows[1]["objects"] == rows[2]["objects"]
 
 
 def test_frames_without_gaussians_and_counts_that_change(files, tmp_path, capsys):

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from functools import cache
 from pathlib import Path
 from typing import Any
 
@@ -18,12 +19,27 @@ SHEET = 9  # frames on a contact sheet
 SIDE_BY_SIDE = 4  # views in the picture of a frame
 FRAMES_PER_SECOND = 10
 LINE = 22  # of text [pixels]
+LEGEND = 20  # objects in it at most
+PALETTE = 4096  # colours before they come again
+
+
+@cache
+def _palette() -> Picture:
+    return class_colours(PALETTE)
+
+
+def object_colours(names: Sequence[str]) -> Picture:
+    """The colour of each object, uint8 [len(names), 3]: of an id always the same, else by its place."""
+    ids = all(name.isdecimal() for name in names)
+    keys = [int(name) for name in names] if ids else range(len(names))
+    found: Picture = _palette()[np.array(keys, np.int64) % PALETTE]
+    return found
 
 
 def frame_picture(
     photographs: Sequence[Any], images: Sequence[Any], names: Sequence[str], values: Sequence[int], title: str
 ) -> Picture:
-    """Up to four views side by side, objects in their colours, with a legend.
+    """Up to four views side by side, objects in their colours, with a legend of the largest ones that they show.
 
     Args:
         photographs: Of the views, [H, W, 3] each.
@@ -33,7 +49,7 @@ def frame_picture(
     """
     import cv2
 
-    colours = class_colours(len(names))
+    colours = object_colours(names)
     table = np.full(max([*values, 255]) + 2, -1)
     table[list(values)] = np.arange(len(values))
     chosen = list(zip(photographs, images, strict=True))[:SIDE_BY_SIDE]
@@ -46,7 +62,12 @@ def frame_picture(
         y, x = LINE + k // columns * height, k % columns * width
         board[y : y + len(tile), x : x + tile.shape[1]] = tile
     cv2.putText(board, title, (6, LINE - 7), cv2.FONT_HERSHEY_SIMPLEX, 0.45, (0, 0, 0), 1, cv2.LINE_AA)
-    return with_legend(board, list(names), colours)
+    shown = np.zeros(len(names), np.int64)
+    for _, image in chosen:
+        place = table[np.asarray(image, dtype=np.int64)]
+        shown += np.bincount(place[place >= 0], minlength=len(names))
+    largest = sorted(k for k in np.argsort(-shown, kind="stable")[:LEGEND].tolist() if shown[k])
+    return with_legend(board, [names[k] for k in largest], colours[largest])
 
 
 def write_contact_sheet(path: Path, pictures: Sequence[Path]) -> None:
@@ -98,7 +119,7 @@ def write_trajectories(path: Path, tracks: dict[str, Any]) -> bool:
     except ImportError:
         return False
     objects = tracks["objects"]
-    colours = class_colours(len(objects)) / 255.0
+    colours = object_colours(list(objects)) / 255.0
     figure = Figure(figsize=(11, 4.5), layout="constrained")
     FigureCanvasAgg(figure)
     above, over_time = figure.subplots(1, 2)
@@ -109,11 +130,12 @@ def write_trajectories(path: Path, tracks: dict[str, Any]) -> bool:
         if not rows:
             continue
         times, places = np.array([t for t, _ in rows]), np.array([c for _, c in rows])
+        gaps = np.flatnonzero(np.diff(times) > 1) + 1  # while it was away there is no line
+        last = places[-1, [0, 2]]
+        places, times = np.insert(places, gaps, np.nan, axis=0), np.insert(times.astype(float), gaps, np.nan)
         above.plot(places[:, 0], places[:, 2], color=color, label=name, lw=1.2)
-        above.plot(*places[-1, [0, 2]], "o", color=color, ms=5)
-        jumps = np.diff(times, prepend=times[0]) > 1
-        height = np.where(jumps, np.nan, -places[:, 1])
-        over_time.plot(times, height, color=color, lw=1.2)
+        above.plot(*last, "o", color=color, ms=5)
+        over_time.plot(times, -places[:, 1], color=color, lw=1.2)
     above.set(xlabel="x [m]", ylabel="z [m]", title="centroids from above; a dot is the last sight", aspect="equal")
     over_time.set(xlabel="frame", ylabel="-y [m]", title="height of the centroids (y down)")
     above.legend(fontsize=7, loc="center left", bbox_to_anchor=(1.0, 0.5))

@@ -52,6 +52,15 @@ class Output:
     settings: dict[str, Any] = field(default_factory=dict)
 
 
+@dataclass(frozen=True, eq=False)
+class _Told:
+    """A frame, what was answered, and of which views."""
+
+    tracked: TrackedFrame
+    answer: Answer
+    asked: list[FrameView]
+
+
 def run_tracking(
     sequence: GaussianSequence,
     views: MovingViews,
@@ -80,10 +89,12 @@ def run_tracking(
         if store is not None:
             store.resume(first - 1)
     report(first, total, "")
+    last: _Told | None = None
     started = time.perf_counter()
     with deferred_interrupt() as interrupted:
         for index in range(first, total):
-            tracked, channels = _one(sequence, views, tracker, questions, output, index, channels)
+            last = _one(sequence, views, tracker, questions, output, index, channels, last)
+            tracked, channels = last.tracked, last.answer.channels.cpu()
             if store is not None:
                 with log.stage("write"):
                     store.write(tracked)
@@ -107,8 +118,9 @@ def _one(
     output: Output,
     index: int,
     before: Tensor,
-) -> tuple[TrackedFrame, Tensor]:
-    """Track one frame and write its folder."""
+    last: _Told | None,
+) -> _Told:
+    """Track one frame and write its folder; a frame in which nothing changed is answered as the one before."""
     log = tracker.log
     with log.stage("read"):
         frame = sequence.frame(index)
@@ -116,10 +128,24 @@ def _one(
     tracked = tracker.step(frame, shown)
     asked = shown if output.masks is None else views_at(output.masks, index)
     with log.stage("ask"):
-        found = answer(tracked, questions, [view.view for view in asked])
+        if last is not None and tracked.unchanged and _same_cameras(asked, last.asked):
+            found = last.answer
+            log.leave_out("answers_that_did_not_change")
+        else:
+            found = answer(tracked, questions, [view.view for view in asked])
     with log.stage("write"):
         _write(output, tracked, found, asked, before)
-    return tracked, found.channels.cpu()
+    return _Told(tracked, found, asked)
+
+
+def _same_cameras(asked: list[FrameView], before: list[FrameView]) -> bool:
+    """Whether the same views look from the same places."""
+    return len(asked) == len(before) and all(
+        (one.view.stem, one.view.camera.size) == (other.view.stem, other.view.camera.size)
+        and torch.equal(one.view.camera.K, other.view.camera.K)
+        and torch.equal(one.view.camera.world_to_camera, other.view.camera.world_to_camera)
+        for one, other in zip(asked, before, strict=True)
+    )
 
 
 def _write(output: Output, tracked: TrackedFrame, found: Answer, asked: list[FrameView], before: Tensor) -> None:
@@ -133,11 +159,18 @@ def _write(output: Output, tracked: TrackedFrame, found: Answer, asked: list[Fra
         picture = pictures.frame_picture(photographs, images, found.names, found.values, f"frame {tracked.index}")
         write_rgb(output.folder / "overlays" / f"{tracked.index:05d}.jpg", picture)
     now = found.channels.cpu()
-    changed = int(((now != before) & (now >= 0) & (before >= 0)).sum()) if len(now) == len(before) else None
-    row = {"frame": tracked.index, "objects": found.objects, "scores": found.scores, "changed_object": changed}
+    row = {"frame": tracked.index, "objects": found.objects, "scores": found.scores}
+    row |= {"changed_object": count_changes(before, now)}
     row |= {"views": [view.view.stem for view in asked], "left_out": round(tracked.work.left_out, 6)}
     with atomic_path(folder / FRAME_FILE) as temporary:
         temporary.write_text(json.dumps(row, allow_nan=False), encoding="utf-8")
+
+
+def count_changes(before: Tensor, now: Tensor) -> int | None:
+    """Gaussians that belong to another object than before, -1 for none [N]; None where their number changed."""
+    if len(now) != len(before):
+        return None
+    return int(((now != before) & (now >= 0) & (before >= 0)).sum())
 
 
 def _photograph(tracked: TrackedFrame, view: View) -> Any:

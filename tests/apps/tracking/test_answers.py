@@ -9,7 +9,7 @@ import torch
 from sgwarp.apps.tracking import pictures
 from sgwarp.apps.tracking.answers import Questions, answer, query_scores
 from sgwarp.apps.tracking.facts import sequence_facts
-from sgwarp.apps.tracking.run import gather
+from sgwarp.apps.tracking.run import count_changes, gather
 from sgwarp.apps.tracking.sources import LabelFrames
 from sgwarp.apps.tracking.tracker import TrackedFrame
 from sgwarp.errors import InputError
@@ -74,6 +74,12 @@ def test_what_nothing_saw_belongs_to_no_object(stage, toy_text):
     assert [row["gaussians"] > 0 for row in found.objects] == [True, True, False, True]
 
 
+def test_a_gaussian_changes_from_one_object_to_another_not_from_none():
+    before, now = torch.tensor([0, 1, -1, 2, -1]), torch.tensor([0, 2, 1, -1, -1])
+    assert count_changes(before, now) == 1
+    assert count_changes(before, now[:4]) is None
+
+
 def test_rows_become_tracks_in_the_order_of_the_ids():
     def row(frame, *names):
         objects = [{"name": name, "gaussians": frame, "centroid": None, "extent": None} for name in names]
@@ -126,3 +132,37 @@ def test_facts_leave_out_steps_that_are_not_finite():
     facts = sequence_facts(Two())
     assert (facts["moving_share"], facts["largest_step"]) == (0.75, 4.0)
     assert facts["non_finite_rows"] == 1
+
+
+def test_a_legend_names_what_is_shown_in_colors_that_stay():
+    """Two of 60 objects are shown: no legend is longer, and colors are those of the ids."""
+    names = tuple(str(k) for k in range(1, 61))
+    image, photograph = np.zeros((40, 60), np.uint8), np.full((40, 60, 3), 255, np.uint8)
+    image[:, :20], image[:, 20:30] = 7, 50
+    picture = pictures.frame_picture([photograph], [image], names, range(1, 61), "title")
+    assert len(picture) == pictures.LINE + 40
+    wanted = pictures.object_colours(("7", "50"))
+    legend = picture[:, 60:].reshape(-1, 3)
+    found = [bool((legend == color).all(axis=1).any()) for color in (*wanted, *pictures.object_colours(("8",)))]
+    assert found == [True, True, False]
+    few = pictures.frame_picture([photograph], [image], ("7", "50"), (7, 50), "title")
+    np.testing.assert_array_equal(few, picture)
+    many = np.arange(2400).reshape(40, 60) // 40 + 1
+    assert len(pictures.frame_picture([photograph], [many], names, range(1, 61), "t")) < 20 * pictures.LINE + 10
+
+
+def test_trajectories_have_gaps_where_an_object_was_away(tmp_path):
+    """A line from (0, 0) to (10, 0) would cross the middle of the plot, where there is nothing."""
+
+    def plot(visible):
+        count = len(visible)
+        centers = [[0.0 if k < count // 2 else 10.0, 0.0, 0.01 * k] for k in range(count)]
+        one = {"centroid": centers, "visible": visible}
+        assert pictures.write_trajectories(tmp_path / "t.png", {"frames": list(range(count)), "objects": {"1": one}})
+        picture = read_rgb(tmp_path / "t.png").astype(int)
+        color = pictures.object_colours(("1",))[0]
+        middle = picture[60:-80, 250:450]
+        return int((np.abs(middle - color).sum(axis=2) < 40).sum())
+
+    assert plot([True] * 8) > 100
+    assert plot([True] * 3 + [False] * 2 + [True] * 3) == 0

@@ -235,6 +235,24 @@ def test_a_missing_photograph_leaves_its_view_out(scene):
     assert source.seen == [(0, "0")]
     assert tracker.log.left_out["views_without_photograph"] == 1
     assert tracker.log.left_out["photographs_rendered_instead"] == 1
+    source.needs_image = False  # label images do not ask for photographs
+    source.encode = lambda frame, view, image: FeatureMap("toy", dense=torch.ones(72, 96, 3))
+    tracker = Tracker(source, ALONE)
+    tracker.step(Recorded(scene).frame(0), views)
+    assert "views_without_photograph" not in tracker.log.left_out
+
+
+def test_pictures_rendered_instead_of_photographs_lie_between_0_and_1(scene):
+    class Bright:
+        space, needs_image = "toy", True
+
+        def encode(self, frame, view, image):
+            assert 0.0 <= float(image.min()) < float(image.max()) == 1.0
+            return FeatureMap("toy", dense=image)
+
+    frame = Recorded(scene).frame(0)
+    lit = replace(frame.gaussians, sh=10 * frame.gaussians.sh.abs())
+    Tracker(Bright(), ALONE).step(replace(frame, gaussians=lit), [FrameView(scene.cameras[0])])
 
 
 def test_counts_that_change_need_ids(scene, truth):
@@ -311,6 +329,20 @@ def test_masks_without_identity_become_objects():
     assert len(set(settled[-1].values())) == len(large)
 
 
+@pytest.mark.parametrize("apart", [set(), {(0, 1)}])
+def test_a_mask_of_two_objects_joins_them_unless_they_were_seen_as_two(apart):
+    source = Associated(None)
+    source.count, source._apart, source._sums = 2, set(apart), LiftSums.zeros(2, 2)
+    source._sums.features[:] = torch.eye(2)
+    masks, expected = torch.zeros(10, 10, dtype=torch.int64), torch.zeros(10, 10, dtype=torch.int64)
+    expected[5:] = 1  # half of the one mask shows the second object
+    table, joined = source._match(masks, expected, True)
+    assert table.tolist() == [0, -1]
+    assert joined == (not apart)
+    assert source.joined == ([] if apart else [(0, 1)])
+    assert source._sums.features.tolist() == ([[1, 0], [0, 1]] if apart else [[1, 0], [1, 0]])
+
+
 def test_what_became_one_object_is_one_in_the_past_too():
     fusion = Fusion(FusionSettings(0.5), labels=True)
     fusion.join(0, 1)  # nothing is known yet
@@ -339,6 +371,16 @@ def test_forgetting_by_hand():
     found = fusion.update(sums_of([[0.0, 1.0], [1.0, 0.0]], [3.0, 1.0]), None)
     assert found.weight.tolist() == [3.0, 3.0]  # twice: dropped; or agreed again: 4 / 2 + 1
     assert found.features.tolist() == [[0.0, 3.0], [3.0, 0.0]]
+
+
+def test_a_frame_that_does_not_see_a_gaussian_neither_contradicts_nor_agrees():
+    fusion = Fusion(FusionSettings(0.5, patience=2), labels=True)
+    fusion.update(sums_of([[1.0, 0.0]], [4.0]), None)
+    assert fusion.update(sums_of([[0.0, 1.0]], [1.0]), None).against.tolist() == [1.0]
+    assert fusion.update(sums_of([[0.0, 0.0]], [0.0]), None).against.tolist() == [1.0]
+    assert fusion.update(sums_of([[0.0, 1.0]], [2.0]), None).weight.tolist() == [2.0]  # the second time: dropped
+    fusion.update(sums_of([[1.0, 0.0]], [1.0]), None)
+    assert fusion.update(sums_of([[0.0, 1.0]], [1.0]), None).against.tolist() == [0.0]  # agreeing starts anew
 
 
 def test_in_a_text_space_a_contradiction_is_four_times_the_usual_distance():
