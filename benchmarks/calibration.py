@@ -1,6 +1,6 @@
 """What answers paint that is not there: scorings of the default encoder, on the room they were chosen on and elsewhere.
 
-    SGWARP_DATA=FOLDER python -m benchmarks.calibration [--castle SCENE.ply VIEWS] [--count 60000] [--out FILE.json]
+    SGWARP_DATA=FOLDER python -m benchmarks.calibration [room] [generated] [--castle SCENE.ply VIEWS]
 
 room: furniture mIoU, precision and recall over the pixels of four held-out views of the rendered room, and the share of
 pixels painted with one of twelve things that are not there; also for other settings of the calibration. generated: the
@@ -72,7 +72,7 @@ class Scene:
         votes = class_votes(self.semantics, names, Speaker(way))
         found = [segment_votes(self.gaussians, camera, votes, self.semantics.seen)[0] for camera in self.cameras]
         figures = {"painted": sum(float((image >= 0).float().mean()) for image in found) / len(found)}
-        if not self.truth or not any(name in self.truth[0] for name in names):
+        if not self.truth or not all(name in self.truth[0] for name in names):
             return figures
         hits = torch.zeros(3, len(names), dtype=torch.float64)  # both, found, true
         for image, truth in zip(found, self.truth, strict=True):
@@ -123,6 +123,7 @@ def words(text: str) -> list[str]:
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("parts", nargs="*", choices=["room", "generated", []], help="both if none is named")
     parser.add_argument("--castle", type=Path, nargs=2, metavar=("SCENE", "VIEWS"))
     parser.add_argument("--count", type=int, default=60_000, help="Gaussians of the rendered room")
     parser.add_argument("--out", type=Path, default=Path(__file__).with_name("calibration.json"))
@@ -130,7 +131,8 @@ def main() -> None:
     data = os.environ.get("SGWARP_DATA")
     if data is None:
         raise SystemExit("set SGWARP_DATA to the folder that holds room/")
-    results: dict[str, Any] = {}
+    results: dict[str, Any] = json.loads(options.out.read_text()) if options.out.is_file() else {}
+    asked = options.parts or ["room", "generated"]
 
     def ask(title: str, scene: Scene, questions: dict[str, Sequence[str]], ways: dict[str, Calibration]) -> None:
         for what, names in questions.items():
@@ -139,12 +141,13 @@ def main() -> None:
                 print(f"{title} | {what} | {way}:", {k: round(v, 4) for k, v in row.items()}, flush=True)
         options.out.write_text(json.dumps(results, indent=1) + "\n")
 
-    scene, furniture = room(Path(data) / "room", options.count)
-    questions: dict[str, Sequence[str]] = {"furniture": furniture, "absent": words(ABSENT)}
-    ask("room", scene, questions, WAYS | SETTINGS)
-    furniture_kinds = [name for name in CLASSES if name not in ("floor", "ceiling", "wall")]
+    if "room" in asked:
+        scene, furniture = room(Path(data) / "room", options.count)
+        ask("room", scene, {"furniture": furniture, "absent": words(ABSENT)}, WAYS | SETTINGS)
+    kinds = [name for name in CLASSES if name not in ("floor", "ceiling", "wall")]
     elsewhere: dict[str, Sequence[str]] = {"absent": words(ELSEWHERE), "fox, bookcase, wall, desk": WALLS}
-    ask("generated", generated(), {"furniture": furniture_kinds} | elsewhere, WAYS)
+    if "generated" in asked:
+        ask("generated", generated(), {"furniture": kinds} | elsewhere, WAYS)
     if options.castle:
         ask("castle", castle(*options.castle), elsewhere | {"palace": ["palace"]}, WAYS)
 
