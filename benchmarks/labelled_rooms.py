@@ -94,7 +94,7 @@ def corrupt(labels: Tensor, classes: int, seed: int) -> Tensor:
     return torch.from_numpy(np.where(hit & (wrong >= 0), shown, wrong))
 
 
-def rendered_room(folder: Path, count: int = 40_000, scale: int = 2) -> LabelledRoom:
+def rendered_room(folder: Path, count: int = 30_000, scale: int = 3) -> LabelledRoom:
     """The room of SGWARP_DATA, images divided by `scale`."""
     views = sg.load_views(folder)
     depths = {view.stem: read_ids(folder / "depth" / f"{view.stem}.png").astype(np.float32) * 1e-3 for view in views}

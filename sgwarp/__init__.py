@@ -35,6 +35,7 @@ if TYPE_CHECKING:
     from sgwarp.io.store import save_semantics as save_semantics
     from sgwarp.io.views import load_views as load_views
     from sgwarp.lifting.lifter import lift as lift
+    from sgwarp.lifting.settings import LiftSettings as LiftSettings
     from sgwarp.network.prediction import predict as predict
     from sgwarp.network.semantic_network import SemanticNetwork as SemanticNetwork
     from sgwarp.network.semantic_network import load_network as load_network
@@ -86,6 +87,7 @@ _HOME = {
     "Instance": "sgwarp.scene",
     "InstanceMap": "sgwarp.scene",
     "InstanceSettings": "sgwarp.apps.instances.settings",
+    "LiftSettings": "sgwarp.lifting.settings",
     "RasterSettings": "sgwarp.ops.splatting.settings",
     "RenderPlan": "sgwarp.ops.splatting.plan",
     "RunLog": "sgwarp.runs.log",

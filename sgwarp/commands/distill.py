@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Literal
 
@@ -15,9 +16,11 @@ from sgwarp.runs.progress import show_progress
 if TYPE_CHECKING:
     from torch import Tensor
 
-    from sgwarp.network.training.data import TrainingScene
+    from sgwarp.network.training.contrastive import MaskedView
+    from sgwarp.network.training.data import LoadMasks, TrainingScene
     from sgwarp.network.training.settings import DistillSettings
     from sgwarp.runs.log import RunLog
+    from sgwarp.scene import View
 
 
 @dataclass(kw_only=True)
@@ -59,6 +62,17 @@ class Distill(Options):
     scenes_per_step: int = 1
     """Scenes whose gradients are averaged before a step, over all processes."""
 
+    loss: Literal["cosine", "contrastive"] = "cosine"
+    """cosine: features of voxels against lifted ones, as in the paper; contrastive: rendered features against masks of
+    the views, which lie in the folder {name}/ beside {name}.ply."""
+
+    encoder: str = "conse"
+    """Encoder of the masks for the contrastive loss, the one that the scenes were lifted with; {views} stands for a
+    scene's folder of views, as in files:{views}/labels."""
+
+    views_per_step: int = 2
+    """Views of a scene that the contrastive loss looks at in a step."""
+
     by_reliability: bool = False
     """Weigh a voxel by the weight and the views behind its lifted features."""
 
@@ -89,7 +103,8 @@ class Distill(Options):
             from sgwarp.network.training.data import scenes_in
             from sgwarp.network.training.trainer import distill, state_path
 
-            scenes, validation = scenes_in(self.scenes), scenes_in(self.validation or [])
+            masks = self._masks_of if self.loss == "contrastive" else None
+            scenes, validation = scenes_in(self.scenes, masks), scenes_in(self.validation or [])
             settings = self._settings()
             with show_progress("distill") as progress:
                 network, history = distill(
@@ -126,11 +141,30 @@ class Distill(Options):
             epochs=self.epochs,
             learning_rate=self.learning_rate,
             scenes_per_step=self.scenes_per_step,
+            loss=self.loss,
+            views_per_step=self.views_per_step,
             by_reliability=self.by_reliability,
             augment=Augmentation(up="xyz".index(self.up)) if self.augment else None,
             half=self.half,
             seed=self.seed,
         )
+
+    def _masks_of(self, scene: Path) -> list[LoadMasks]:
+        """What loads the masks of each view beside a scene, in the order of the views."""
+        from sgwarp.encoders.cache import default_folder
+        from sgwarp.encoders.registry import make_encoder
+        from sgwarp.io.views import load_views
+        from sgwarp.network.training.contrastive import MaskedView
+
+        folder = scene.with_name(scene.name.removesuffix(".ply").removesuffix(".compressed"))
+        views = load_views(folder)
+        source = make_encoder(self.encoder.replace("{views}", str(folder)), views, self.device, default_folder())
+        has_map = getattr(source, "has_map", lambda view: True)
+
+        def load(view: View) -> MaskedView:
+            return MaskedView(view.camera, source.encode(view, view.image() if source.needs_image else None))
+
+        return [partial(load, view) for view in views if has_map(view)]
 
     def _class_vectors(self, scenes: list[TrainingScene], log: RunLog) -> Tensor | None:
         """Text vectors of the classes, in the space of the scenes' semantics."""

@@ -23,6 +23,10 @@ METHOD_KINDS: tuple[str, ...] = get_args(Kind)
 ABOUT_MODES = {
     "weighted": "all pixels a Gaussian contributes to, by its weight there",
     "center": "the pixel of its center, with a depth test (the paper)",
+    "squared": "as weighted, with squared weights",
+    "strongest": "only pixels where it contributes most (as OpenGaussian, Dr. Splat, LightSplat vote)",
+    "robust": "geometric median of the views",
+    "solve": "what renders best to the maps, near the weighted mean",
 }
 
 
@@ -83,7 +87,18 @@ class Method:
 
 
 IMAGES = Method("2d", "the 2D encoder alone, on the asked view itself", "images")
-RIVALS: tuple[Method, ...] = ()
+FIT = "sgwarp.evaluation.rivals.optimization:fit_features"
+RIVALS: tuple[Method, ...] = (
+    Method(
+        "nearest",
+        "features fused on points, and of each Gaussian those of its nearest point (OpenScene)",
+        make="sgwarp.evaluation.rivals.nearest_points:fuse_nearest_points",
+    ),
+    Method("fitted", "gradient descent on all channels (Feature 3DGS)", make=FIT),
+    Method(
+        "fitted-low", "gradient descent on 16 channels and a decoder (Feature 3DGS)", make=FIT, options={"channels": 16}
+    ),
+)
 
 
 def list_methods() -> tuple[Method, ...]:

@@ -93,6 +93,7 @@ def fit_features(
         with torch.no_grad():
             features.copy_(0.1 * torch.randn(features.shape, generator=generator))
             decoder.weight.copy_(torch.randn(decoder.weight.shape, generator=generator) / channels**0.5)
+            decoder.bias.zero_()
         parameters.append({"params": list(decoder.parameters()), "lr": DECODER_RATE})
     adam = torch.optim.Adam(parameters, eps=1e-15)
     touched = torch.zeros(len(gaussians), dtype=torch.bool, device=gaussians.device)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from functools import cache, partial
 from pathlib import Path
 
 import torch
@@ -13,9 +14,12 @@ from sgwarp.errors import InputError
 from sgwarp.network.augmentation import Augmentation
 from sgwarp.network.inputs import InputMode, voxelize
 from sgwarp.network.layers.sparse import SparseTensor
+from sgwarp.network.training.contrastive import MaskedView
 from sgwarp.scene import Gaussians, Semantics
 
 CHUNK = 65536  # Gaussians whose features are widened at once
+LoadMasks = Callable[[], MaskedView]
+MasksOf = Callable[[Path], list[LoadMasks]]
 
 
 @dataclass(frozen=True)
@@ -26,13 +30,15 @@ class TrainingScene:
     load: Callable[[], tuple[Gaussians, Semantics]]
     stamp: str = ""  # changes when the files do: a run is not resumed on other data
     files: tuple[Path, ...] = ()
+    masks: Callable[[], list[LoadMasks]] | None = None  # of the views, for the contrastive loss
 
 
-def scenes_in(paths: Sequence[Path]) -> list[TrainingScene]:
+def scenes_in(paths: Sequence[Path], masks: MasksOf | None = None) -> list[TrainingScene]:
     """Scenes {name}.ply with what `sgwarp lift` wrote for them, {name}.safetensors, beside each.
 
     Args:
         paths: Scenes, or folders of them.
+        masks: Masks of the views of a scene, given its path, for the contrastive loss.
 
     Raises:
         InputError: A folder holds no scene, or a scene has no semantics beside it.
@@ -43,10 +49,10 @@ def scenes_in(paths: Sequence[Path]) -> list[TrainingScene]:
         if not inside:
             raise InputError(f"{path}: holds no scene .ply")
         found += inside
-    return [_scene(path) for path in found]
+    return [_scene(path, masks) for path in found]
 
 
-def _scene(path: Path) -> TrainingScene:
+def _scene(path: Path, masks: MasksOf | None) -> TrainingScene:
     semantics = path.with_name(path.name.removesuffix(".ply").removesuffix(".compressed") + ".safetensors")
     if not path.is_file():
         raise InputError(f"{path}: no such file; check the path")
@@ -62,7 +68,7 @@ def _scene(path: Path) -> TrainingScene:
 
     files = (path, semantics)
     stamp = " ".join(f"{file.stat().st_size}:{file.stat().st_mtime_ns}" for file in files)
-    return TrainingScene(str(path), load, stamp, files)
+    return TrainingScene(str(path), load, stamp, files, None if masks is None else cache(partial(masks, path)))
 
 
 @dataclass(frozen=True, eq=False)
@@ -74,12 +80,14 @@ class Example:
         targets: Mean direction of the lifted features in each voxel that has some, unit vectors [T, C].
         rows: Their voxels, int64 [T].
         weights: Reliability of each target, or ones, [T].
+        of_gaussians: Voxel of every Gaussian, -1 for none, int64 [N].
     """
 
     voxels: SparseTensor
     targets: Tensor
     rows: Tensor
     weights: Tensor
+    of_gaussians: Tensor
 
 
 def reliability(semantics: Semantics) -> Tensor:
@@ -131,4 +139,4 @@ def make_example(
     filled = (sums.square().sum(dim=1) > 0).nonzero()[:, 0]
     targets = torch.nn.functional.normalize(sums[filled], dim=1, eps=1e-20)
     mean_trust = weights[filled] / sums.new_zeros(count).index_add_(0, here, torch.ones_like(trust[known]))[filled]
-    return Example(voxels, targets, filled, mean_trust)
+    return Example(voxels, targets, filled, mean_trust, rows)

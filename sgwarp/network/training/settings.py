@@ -4,10 +4,13 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, field
+from typing import Literal, get_args
 
 from sgwarp.errors import InputError
 from sgwarp.network.augmentation import Augmentation
 from sgwarp.network.inputs import InputMode
+
+Loss = Literal["cosine", "contrastive"]
 
 
 @dataclass(frozen=True)
@@ -25,6 +28,11 @@ class DistillSettings:
         by_reliability: Weigh the loss of a voxel by how far its lifted features can be trusted.
         augment: Random changes of the scenes; None for none.
         half: Multiply in bfloat16; sums, weights and their gradients stay in float32.
+        loss: "cosine" compares features of voxels with lifted ones (the paper); "contrastive" rendered features of
+            masks with the masks' vectors, see `contrastive`.
+        views_per_step: Views of a scene that the contrastive loss looks at in a step.
+        contributors: Gaussians that a pixel has in it, the strongest ones.
+        temperature: Of its softmax.
         validate_every: Epochs between two looks at the validation scenes.
         seed: Of the first weights, the order of the scenes and their changes.
     """
@@ -39,17 +47,24 @@ class DistillSettings:
     by_reliability: bool = False
     augment: Augmentation | None = field(default_factory=Augmentation)
     half: bool = False
+    loss: Loss = "cosine"
+    views_per_step: int = 2
+    contributors: int = 16
+    temperature: float = 0.07
     validate_every: int = 1
     seed: int = 0
 
     def __post_init__(self) -> None:
-        for name in ("voxel", "learning_rate", "epochs", "scenes_per_step", "validate_every"):
+        counts = ("epochs", "scenes_per_step", "validate_every", "views_per_step", "contributors")
+        for name in ("voxel", "learning_rate", "temperature", *counts):
             value = getattr(self, name)
             if not 0 < value < math.inf:
                 raise InputError(f"{name}: expected a number above 0, got {value}")
-        for name in ("epochs", "scenes_per_step", "validate_every"):
+        for name in counts:
             if getattr(self, name) != int(getattr(self, name)):
                 raise InputError(f"{name}: expected a whole number, got {getattr(self, name)}")
+        if self.loss not in get_args(Loss):
+            raise InputError(f"loss: expected one of {', '.join(get_args(Loss))}, got '{self.loss}'")
         if not 0 <= self.weight_decay < math.inf:
             raise InputError(f"weight_decay: expected a number that is not negative, got {self.weight_decay}")
 
@@ -65,7 +80,7 @@ class Epoch:
     Attributes:
         epoch: Counted from 1.
         learning_rate: Of its steps.
-        loss: Mean over the scenes of the mean of 1 - cosine over their voxels.
+        loss: Mean over the scenes of the mean of 1 - cosine over their voxels, or of their views' contrastive loss.
         seconds: Wall time, validation included.
         cosine: Mean cosine of prediction and projection over the Gaussians of the validation scenes.
         miou: mIoU of the predicted class against the projected one, over those Gaussians.

@@ -26,6 +26,7 @@ from sgwarp.network.inputs import INPUT_CHANNELS
 from sgwarp.network.layers.mink_unet import MinkUNet
 from sgwarp.network.prediction import predict
 from sgwarp.network.semantic_network import SemanticNetwork
+from sgwarp.network.training.contrastive import MaskRows, contrastive_loss, mask_rows
 from sgwarp.network.training.data import CHUNK, Example, TrainingScene, make_example
 from sgwarp.network.training.processes import Processes
 from sgwarp.network.training.settings import DistillSettings, Epoch
@@ -204,12 +205,14 @@ class _Run:
         self.optimizer.zero_grad(set_to_none=False)
         for index in chosen[self.processes.rank :: self.processes.count]:
             with self.log.stage("prepare"):
-                example = self._example(scenes[index], _generator(self.settings.seed, epoch, index))
-            if not len(example.rows):
+                generator = _generator(self.settings.seed, epoch, index)
+                example = self._example(scenes[index], generator)
+                masks = self._masks(scenes[index], example, generator)
+            if not (masks if masks is not None else len(example.rows)):
                 continue
             with self.log.stage("train"):
                 torch._foreach_copy_(statistics, before)
-                loss = self._loss(example)
+                loss = self._loss(example, masks)
                 loss.backward()
                 torch._foreach_add_(sums, statistics)
             figures += torch.tensor([float(loss.detach()), 1.0], dtype=torch.float64, device=self.device)
@@ -243,11 +246,28 @@ class _Run:
             by_reliability=s.by_reliability,
         )
 
-    def _loss(self, example: Example) -> Tensor:
-        """Mean of 1 - cosine over the voxels that have a target (paper, Sec. III-C), weighted if asked for."""
+    def _masks(self, scene: TrainingScene, example: Example, generator: torch.Generator) -> list[MaskRows] | None:
+        """Masks of some views at random, for the contrastive loss; None for the other."""
+        s = self.settings
+        if s.loss == "cosine":
+            return None
+        if scene.masks is None:
+            raise InputError(f"{scene.name}: the contrastive loss needs the masks of its views")
+        gaussians = scene.load()[0].to(self.device)
+        views = scene.masks()
+        chosen = torch.randperm(len(views), generator=generator)[: s.views_per_step].tolist()
+        found = [mask_rows(gaussians, example.of_gaussians, views[k](), s.contributors) for k in chosen]
+        return [rows for rows in found if len(rows.vectors)]
+
+    def _loss(self, example: Example, masks: list[MaskRows] | None = None) -> Tensor:
+        """Mean of 1 - cosine over the voxels that have a target (paper, Sec. III-C), weighted if asked for; with masks
+        the mean contrastive loss of their views."""
         with torch.autocast(self.device.type, dtype=torch.bfloat16, enabled=self.settings.half):
-            predicted = self.network.net(example.voxels).features[example.rows]
-        cosine = torch.nn.functional.cosine_similarity(predicted.float(), example.targets, dim=1)
+            predicted = self.network.net(example.voxels).features.float()
+        if masks is not None:
+            losses = [contrastive_loss(predicted, rows, self.settings.temperature) for rows in masks]
+            return torch.stack(losses).mean()
+        cosine = torch.nn.functional.cosine_similarity(predicted[example.rows], example.targets, dim=1)
         return ((1.0 - cosine) * example.weights).sum() / example.weights.sum()
 
     def validate(self, scenes: Sequence[TrainingScene]) -> dict[str, float | None]:
