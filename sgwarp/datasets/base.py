@@ -165,10 +165,15 @@ def scene_folder(root: Path, name: str, listed: Sequence[str]) -> Path:
     Raises:
         InputError: The data set has no such scene.
     """
+    require_scene(root, name, listed)
+    return root if name == root.name and not (root / name).is_dir() else root / name
+
+
+def require_scene(root: Path, name: str, listed: Sequence[str]) -> None:
+    """Raise InputError unless a data set has a scene."""
     if name not in listed:
         there = ", ".join(listed[:8]) + (", ..." if len(listed) > 8 else "") if listed else "none"
         raise InputError(f"{root}: has no scene '{name}'; there are: {there}")
-    return root if name == root.name and not (root / name).is_dir() else root / name
 
 
 def read_class_names(path: Path) -> tuple[str, ...]:

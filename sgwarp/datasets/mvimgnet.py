@@ -14,8 +14,7 @@ from pathlib import Path
 import torch
 from torch import Tensor
 
-from sgwarp.datasets.base import SceneData, absent, folders_in, image_stems, read_class_names, trained_in
-from sgwarp.errors import InputError
+from sgwarp.datasets.base import SceneData, absent, folders_in, image_stems, read_class_names, require_scene, trained_in
 from sgwarp.files.images import read_ids
 from sgwarp.io.views import load_views
 
@@ -40,9 +39,7 @@ def open_scene(root: Path, name: str) -> SceneData:
     Raises:
         InputError: There is none of that name.
     """
-    listed = list_scenes(root)
-    if name not in listed:
-        raise InputError(f"{root}: has no object '{name}'; there are: {', '.join(listed[:8]) or 'none'}")
+    require_scene(root, name, list_scenes(root))
     folder = root / name
     drawn = image_stems(folder / PARTS) if (folder / NAMES).is_file() else ()
 

@@ -26,6 +26,7 @@ from sgwarp.datasets.base import (
     images_in,
     mask_of,
     query_of_mask,
+    require_scene,
     trained_in,
 )
 from sgwarp.errors import InputError
@@ -55,9 +56,9 @@ def open_scene(root: Path, name: str) -> SceneData:
     Raises:
         InputError: There is none of that name.
     """
-    place, listed = _labels(root), list_scenes(root)
-    if place is None or name not in listed:
-        raise InputError(f"{root}: has no scene '{name}'; there are: {', '.join(listed[:8]) or 'none'}")
+    require_scene(root, name, list_scenes(root))
+    place = _labels(root)
+    assert place is not None
     known = {name, *(name.removesuffix(part) for part in PARTS)}
     folder = next(
         (root / form.format(one) for form in VIEWS for one in known if (root / form.format(one)).is_dir()), None

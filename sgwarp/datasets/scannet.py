@@ -24,7 +24,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from sgwarp.datasets.base import LabelledPoints, SceneData, absent, folders_in, images_in, trained_in
+from sgwarp.datasets.base import LabelledPoints, SceneData, absent, folders_in, images_in, require_scene, trained_in
 from sgwarp.datasets.scannet_classes import COCO20, TABLE, coco_table, read_label_table, to_nyu40
 from sgwarp.errors import InputError
 from sgwarp.files.access import read_bytes
@@ -63,9 +63,7 @@ def open_scene(root: Path, name: str) -> SceneData:
     Raises:
         InputError: There is none of that name.
     """
-    listed = list_scenes(root)
-    if name not in listed:
-        raise InputError(f"{root}: has no scene '{name}'; there are: {', '.join(listed[:8]) or 'none'}")
+    require_scene(root, name, list_scenes(root))
     folder = next(root / place / name for place in PLACES if (root / place / name).is_dir())
     colors = sorted(images_in(folder / "color"), key=lambda path: (len(path.stem), path.stem))
     truth = folder / "label-filt"

@@ -20,7 +20,7 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from sgwarp.datasets.base import LabelledPoints, SceneData, absent, folders_in
+from sgwarp.datasets.base import LabelledPoints, SceneData, absent, folders_in, require_scene
 from sgwarp.errors import InputError
 from sgwarp.files.arrays import read_array
 from sgwarp.scene import Gaussians, Semantics
@@ -48,9 +48,7 @@ def open_scene(root: Path, name: str) -> SceneData:
     Raises:
         InputError: There is none of that name.
     """
-    listed = list_scenes(root)
-    if name not in listed:
-        raise InputError(f"{root}: has no scene '{name}'; there are: {', '.join(listed[:8]) or 'none'}")
+    require_scene(root, name, list_scenes(root))
     folder = root / name
     missing = absent(folder, (*FIELDS, "lang_feat.npy", "valid_feat_mask.npy", "segment.npy"))
     has_labels = (folder / "segment.npy").is_file()

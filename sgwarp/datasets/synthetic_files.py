@@ -19,7 +19,8 @@ from sgwarp.io.scenes import save_gaussians
 from sgwarp.ops.splatting.forward import rasterize
 from sgwarp.scene import Camera
 
-FACES_AT_ONCE = 64
+RAYS_AT_ONCE = 2048
+NEAR = 0.01  # what is nearer to a camera is not seen [m]
 LABEL = "label"  # column of the scene's PLY file: class of each Gaussian
 
 
@@ -33,26 +34,26 @@ def room_truth(room: Room, camera: Camera) -> tuple[Tensor, Tensor]:
     y, x = torch.meshgrid(*(torch.arange(n, dtype=torch.float64) + 0.5 for n in camera.size), indexing="ij")
     rays = torch.stack([x, y, torch.ones_like(x)], dim=2).reshape(-1, 3) @ torch.linalg.inv(camera.K).T
     rays = rays @ camera.world_to_camera[:3, :3]  # z along the optical axis stays 1: the distance is the depth
-    nearest = torch.full((len(rays),), torch.inf, dtype=torch.float64)
-    piece = torch.full((len(rays),), -1, dtype=torch.int64)
-    for start in range(0, len(room.faces), FACES_AT_ONCE):
-        corner, u, v = room.faces[start : start + FACES_AT_ONCE].double().unbind(1)
-        normal = torch.linalg.cross(u, v)
-        depth = ((corner - camera.position) * normal).sum(1) / (rays @ normal.T)  # [rays, faces]
-        point = camera.position + depth[..., None] * rays[:, None] - corner
-        a, b = (_share(point, one, torch.linalg.cross(other, normal)) for one, other in ((u, v), (v, u)))
-        inside = (a >= 0) & (a <= 1) & (b >= 0) & (b <= 1) & (depth > camera.near)
-        best, face = torch.where(inside, depth, torch.inf).min(dim=1)
-        piece = torch.where(best < nearest, room.piece_of_face[start + face], piece)
-        nearest = torch.minimum(nearest, best)
-    seen = torch.isfinite(nearest)
-    classes = torch.where(seen, room.class_of_piece[piece], -1)
-    return classes.view(camera.size), torch.where(seen, nearest, 0.0).view(camera.size)
+    found = [_first_face(room, camera.position, part) for part in rays.split(RAYS_AT_ONCE)]
+    face, depth = (torch.cat(each) for each in zip(*found, strict=True))
+    seen = torch.isfinite(depth)
+    classes = torch.where(seen, room.class_of_piece[room.piece_of_face[face]], -1)
+    return classes.view(camera.size), torch.where(seen, depth, 0.0).view(camera.size)
 
 
-def _share(point: Tensor, side: Tensor, across: Tensor) -> Tensor:
-    """How far along a side of its face each point lies, 0 to 1 inside, [rays, faces]."""
-    return (point * across).sum(dim=2) / (side * across).sum(dim=1)
+def _first_face(room: Room, origin: Tensor, rays: Tensor) -> tuple[Tensor, Tensor]:
+    """The first face on each ray and its distance in lengths of the ray, infinity where there is none, [rays] each."""
+    corner, u, v = room.faces.double().unbind(1)
+    normal = torch.linalg.cross(u, v)
+    distance = ((corner - origin) * normal).sum(dim=1) / (rays @ normal.T)  # [rays, faces]
+    inside = distance > NEAR
+    for side, other in ((u, v), (v, u)):
+        across = torch.linalg.cross(other, normal)
+        across = across / (side * across).sum(dim=1, keepdim=True)  # how far along a side a point lies is linear in it
+        share = ((origin - corner) * across).sum(dim=1) + distance * (rays @ across.T)
+        inside &= (share >= 0) & (share <= 1)
+    nearest, face = torch.where(inside, distance, torch.inf).min(dim=1)
+    return face, nearest
 
 
 def save_room(

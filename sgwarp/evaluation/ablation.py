@@ -240,6 +240,7 @@ def draw_ablation(ablation: Ablation, path: Path) -> bool:
         for x, y, trial in zip(seconds, values, trials, strict=True):
             axes.annotate(trial.variant.value, (x, y), textcoords="offset points", xytext=(5, 4), fontsize=7)
     axes.set_xscale("log")
+    axes.margins(x=0.14, y=0.08)
     axes.set_xlabel("seconds of lifting or training, a scene")
     axes.set_ylabel(f"{name} [%]")
     axes.grid(alpha=0.3)

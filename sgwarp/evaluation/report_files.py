@@ -17,15 +17,11 @@ from sgwarp.metrics.overlap import mean
 from sgwarp.version import __version__
 
 UNSHARED = {"residual", "held_out_residual", "switches"}  # figures that are no share of anything
-LIFT_STAGES = (
-    "read",
-    "gaussians_from_depth",
-    "load_encoder",
-    "encode",
-    "compare",
-    "residual",
-    "draw",
-)  # not of the method itself
+ASK_STAGES = ("query", "answer", "locate")
+OTHER_STAGES = (  # what all methods share, and what only measures or draws
+    *("read", "gaussians_from_depth", "load_encoder", "encode", "compare", "residual", "measure", "match"),
+    *("compare_views", "draw"),
+)
 
 
 def write_tables(found: Evaluation, out: Path, extra: Sequence[Table] = ()) -> list[Path]:
@@ -67,12 +63,12 @@ def as_record(found: Evaluation) -> dict[str, Any]:
 
 def method_seconds(seconds: dict[str, float]) -> float:
     """Seconds of lifting or training alone: not of reading, encoding, checking and drawing, nor of asking."""
-    return sum(value for name, value in seconds.items() if name not in (*LIFT_STAGES, "query", "answer", "locate"))
+    return sum(value for name, value in seconds.items() if name not in (*OTHER_STAGES, *ASK_STAGES))
 
 
 def ask_seconds(seconds: dict[str, float]) -> float:
     """Seconds of asking: scores and views."""
-    return sum(seconds.get(name, 0.0) for name in ("query", "answer", "locate"))
+    return sum(seconds.get(name, 0.0) for name in ASK_STAGES)
 
 
 def headline(found: Evaluation) -> Table:
