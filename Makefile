@@ -28,6 +28,8 @@ help:
 	@echo "make clean      remove what the other targets built"
 
 test: $(VENV)/installed-test
+	@command -v chromium >/dev/null || command -v chromium-browser >/dev/null || command -v google-chrome >/dev/null || \
+		echo "no chromium here: the tests in a browser are skipped (apt-get install chromium)"
 	$(PYTEST) $(ARGS)
 
 test-fast: $(VENV)/installed-test

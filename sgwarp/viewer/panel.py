@@ -41,6 +41,7 @@ class Panel:
         changed: Called when the picture has to be drawn anew.
         splats: Called with whether the browser draws.
         aim: Called with the stem of a view to look from.
+        cameras: Called with whether the views' cameras are drawn.
     """
 
     def __init__(
@@ -50,9 +51,10 @@ class Panel:
         changed: Callable[[], None],
         splats: Callable[[bool], None],
         aim: Callable[[str], None],
+        cameras: Callable[[bool], None],
     ) -> None:
         self._client, self.tab, self._changed = client, tab, changed
-        self._splats, self._aim = splats, aim
+        self._splats, self._aim, self._cameras = splats, aim, cameras
         self._typing: threading.Timer | None = None
         self._closed = False
         self._filling = False  # a control is set by the program, not by the user
@@ -199,7 +201,12 @@ class Panel:
         if bench.materials.views:
             stems = ("-", *(view.stem for view in bench.materials.views))
             self._on(gui.add_dropdown("Look from", stems), lambda stem: stem == "-" or self._aim(stem), redraw=False)
+            self._on(gui.add_checkbox("Cameras of the views", False), self._show_cameras)
         self._on(gui.add_checkbox("Splats in the browser", False), lambda value: self._splats(bool(value)))
+
+    def _show_cameras(self, wanted: bool) -> None:
+        self._cameras(bool(wanted))
+        self.tab.set_cameras(wanted)
 
     # Selection
 
@@ -211,6 +218,8 @@ class Panel:
             self.tab.set_through,
             redraw=False,
         )
+        reach = gui.add_number("Grow by", 0.05, step=0.01, hint="Negative numbers shrink the selection.")
+        self._button("Grow", lambda: self.tab.grow_selection(reach.value))
         self._button("Hide", lambda: self._edit(ops.Fade(0.0)), "Opacity 0; undo shows it again.")
         self._button("Isolate", lambda: self._edit(ops.Isolate(0.05)), "Fade everything else.")
         self._button("Delete", lambda: self._edit(ops.Remove()))

@@ -18,6 +18,7 @@ import torch
 from sgwarp.errors import InputError
 from sgwarp.rendering.orbits import orbit_views
 from sgwarp.scene import View
+from sgwarp.scene.extent import camera_extent
 from sgwarp.viewer import bounds
 from sgwarp.viewer.guard import LOOPBACK, Gate, gated, guard_messages, let_go_quietly
 from sgwarp.viewer.panel import Panel
@@ -30,6 +31,8 @@ logger = logging.getLogger("sgwarp")
 PORT = 8080
 PORTS_TRIED = 20
 MOST_TABS = 16
+MOST_CAMERAS = 300  # that the browser draws
+CAMERA_SIZE = 0.05  # of the extent of all cameras
 STATUS_EVERY = 0.5  # seconds
 
 
@@ -181,7 +184,8 @@ class Session:
         self.tab = Tab(viewer.bench)
         self.canvas = Canvas(client, lambda message: self.panel.tell(message, wrong=True))
         self.stream = Stream(self.canvas, self.tab.shot)
-        self.panel = Panel(client, self.tab, self.changed, self.draw_splats, self.aim)
+        self._frustums: list[Any] = []
+        self.panel = Panel(client, self.tab, self.changed, self.draw_splats, self.aim, self.show_cameras)
         let_go_quietly(client)
         viewer.streamer.add(self.stream)
         self._listen()
@@ -251,6 +255,32 @@ class Session:
             self.client.camera.position = tuple(view.camera.position.tolist())
             self.client.camera.look_at = tuple(self.viewer._target(view).tolist())
             self.client.camera.fov = _fov(view)
+
+    def show_cameras(self, wanted: bool) -> None:
+        """Draw the views' cameras into the scene, or take them away."""
+        for handle in self._frustums:
+            handle.remove()
+        self._frustums = []
+        if not wanted:
+            return
+        views = self.viewer.bench.materials.views[:MOST_CAMERAS]
+        size = CAMERA_SIZE * camera_extent(views)
+        with self.client.atomic():
+            self._frustums = [self._frustum(view, size) for view in views]
+
+    def _frustum(self, view: View, size: float) -> Any:
+        from viser.transforms import SO3
+
+        camera = view.camera
+        return self.client.scene.add_camera_frustum(
+            f"/cameras/{view.stem}",
+            fov=_fov(view),
+            aspect=camera.width / camera.height,
+            scale=size,
+            color=(255, 140, 0),
+            wxyz=SO3.from_matrix(camera.world_to_camera[:3, :3].T.numpy()).wxyz,
+            position=camera.position.numpy(),
+        )
 
     def report(self) -> None:
         """The line at the bottom of the panel."""

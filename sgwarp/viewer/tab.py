@@ -9,6 +9,7 @@ from typing import Any
 from torch import Tensor
 
 from sgwarp.apps.editing.operations import Operation
+from sgwarp.apps.editing.picker import grow
 from sgwarp.errors import InputError
 from sgwarp.querying.scoring import TextScores
 from sgwarp.scene import Camera
@@ -36,6 +37,7 @@ class Look:
         level: Of the instances; empty for the coarsest.
         background: Color behind the scene, in [0, 1].
         through: Whether a rectangle also selects what is hidden.
+        cameras: Whether the browser draws the views' cameras into the picture, which needs its depth.
     """
 
     mode: Mode = "color"
@@ -45,6 +47,7 @@ class Look:
     level: str = ""
     background: tuple[float, float, float] = (0.0, 0.0, 0.0)
     through: bool = False
+    cameras: bool = False
 
 
 class Tab:
@@ -116,6 +119,10 @@ class Tab:
     def set_through(self, value: Any) -> None:
         """Whether a rectangle also selects what is hidden."""
         self._look(through=bool(value))
+
+    def set_cameras(self, value: Any) -> None:
+        """Whether the browser draws the views' cameras into the picture."""
+        self._look(cameras=bool(value))
 
     def _look(self, **changes: Any) -> None:
         with self._lock:
@@ -199,6 +206,20 @@ class Tab:
         assert self.found is not None
         return self.found
 
+    def grow_selection(self, distance: Any) -> Found:
+        """Add what lies within a distance of the selection, or if negative take away what lies within it of the rest
+        [scene units]."""
+        distance = bounds.number("distance", distance, -bounds.FAR_AWAY, bounds.FAR_AWAY)
+        scene = self.bench.scene(self.look.moment)
+        if self.found is None or self._selected_at != scene.revision:
+            raise InputError("nothing is selected; click at an object or draw a rectangle")
+        chosen = self.found.selected if not distance else grow(scene.gaussians.means, self.found.selected, distance)
+        if not bool(chosen.any()):
+            raise InputError(f"distance: {distance:g} would leave nothing selected")
+        self._select(Found(chosen), scene.revision)
+        assert self.found is not None
+        return self.found
+
     def clear_selection(self) -> None:
         """Select nothing."""
         self._select(None, -1)
@@ -234,7 +255,13 @@ class Tab:
         with self._lock:
             look, answers, found = self.look, self.answers, self.found
         scene = self.bench.scene(look.moment)
-        shot = Shot(scene.gaussians, look.mode, background=look.background, threshold=look.threshold)
+        shot = Shot(
+            scene.gaussians,
+            look.mode,
+            background=look.background,
+            threshold=look.threshold,
+            depth=look.cameras,
+        )
         if found is not None and self._selected_at == scene.revision:
             shot = replace(shot, selected=found.selected)
         if look.mode in PAINTED:

@@ -68,10 +68,14 @@ class Client:
     def wait_for(self, kind: str):
         return next(message for message in self.messages if message["type"] == kind)
 
+    def wait_for_control(self, kind: str, label: str) -> str:
+        """Its id."""
+        controls = (message for message in self.messages if message["type"] == kind)
+        return next(control["uuid"] for control in controls if control["props"]["label"] == label)
+
     def wait_for_query_box(self) -> str:
         """Its id."""
-        boxes = (message for message in self.messages if message["type"] == "GuiTextMessage")
-        return next(box["uuid"] for box in boxes if box["props"]["label"] == "Query")
+        return self.wait_for_control("GuiTextMessage", "Query")
 
 
 def picture(client: Client):
@@ -138,6 +142,33 @@ def test_pictures_come_and_follow_the_camera(make_viewer):
     while shown.max() >= 8:  # behind the stage there is nothing
         shown = picture(client)
     assert shown.shape == (60, 80, 3)
+
+
+def test_cameras_are_drawn_into_the_depth_of_the_scene(make_viewer, stage):
+    import cv2
+    import numpy as np
+
+    client = Client(make_viewer())
+    client.look()
+    box = client.wait_for_control("GuiCheckboxMessage", "Cameras of the views")
+    client.send("GuiUpdateMessage", uuid=box, updates={"value": True})
+    shown = [client.wait_for("CameraFrustumMessage") for _ in stage.views]
+    assert [message["name"] for message in shown] == [f"/cameras/{view.stem}" for view in stage.views]
+    pictures = (message for message in client.messages if message["type"] == "BackgroundImageMessage")
+    packed = next(
+        cv2.imdecode(np.frombuffer(message["depth_data"], np.uint8), cv2.IMREAD_COLOR)
+        for message in pictures
+        if message["depth_data"] is not None and message["rgb_data"] is not None
+    )
+    while packed.shape[:2] != (60, 80):  # of a moving picture it is coarser
+        data = next(message["depth_data"] for message in pictures)
+        packed = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_COLOR)
+    red, green, blue = (packed[..., 2 - k].astype(float) for k in range(3))
+    depth = (blue + 256 * green + 65536 * red) / 100_000  # as the page reads it
+    middle = depth[25:35, 35:45]
+    # The page looks along z from the origin: the wall is 4 m away, the door 3 m, and beside the stage there is nothing.
+    assert set(np.round(middle).ravel()) <= {3.0, 4.0}
+    assert depth.max() > 160
 
 
 HOSTILE = [

@@ -63,9 +63,9 @@ def test_depth_and_opacity(tab, stage):
 
 
 def test_depth_for_the_browser_is_that_of_the_panels(tab, stage):
-    from dataclasses import replace
-
-    drawn = draw(replace(tab.shot(), depth=True), tab.camera)
+    assert draw(tab.shot(), tab.camera).depth is None, "nobody asked"
+    tab.set_cameras(True)
+    drawn = draw(tab.shot(), tab.camera)
     truth = stage.depth(stage.views[2])
     lamp = interior(stage.labels(stage.views[2]), 3)
     np.testing.assert_allclose(drawn.depth[lamp], truth.numpy()[lamp], rtol=2e-3)
@@ -310,6 +310,21 @@ def test_what_was_found_is_selected(tab, stage):
     tab.ask("book; lamp")
     found = tab.select_found(1)
     assert set(stage.classes[found.selected].tolist()) == {3}
+
+
+def test_a_selection_grows_and_shrinks_by_a_distance(tab, stage):
+    with pytest.raises(InputError, match="nothing is selected"):
+        tab.grow_selection(0.1)
+    place = place_of(tab.camera, LAMP)
+    small = tab.select_rectangle((place[0] - 0.02, place[1] - 0.02), (place[0] + 0.02, place[1] + 0.02)).selected
+    grown = tab.grow_selection(0.09).selected
+    apart = torch.cdist(stage.gaussians.means.double(), stage.gaussians.means[small].double()).amin(dim=1)
+    assert torch.equal(grown, apart <= 0.09)
+    assert int(grown.sum()) > int(small.sum())
+    tab.grow_selection(-0.09)
+    assert not bool((tab.found.selected & ~grown).any())
+    with pytest.raises(InputError, match="leave nothing"):
+        tab.grow_selection(-5.0)
 
 
 def test_the_selection_is_outlined(tab, stage):

@@ -1,0 +1,144 @@
+"""The viewer as its page sees it: pictures a second while the camera moves, and how soon the first one comes.
+
+    python -m benchmarks.viewer [--seconds 6] [--out benchmarks/viewer.json]
+
+`sgwarp view` serves the demo's room, 100,000 Gaussians, in a process of its own. Chromium, with GL in software on the
+same cores, shows a canvas of 640 x 480 and turns the camera. A picture counts when the page has decoded it. Kernels are
+compiled before the clock starts. Needs Playwright and Debian's chromium.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import math
+import os
+import re
+import shutil
+import statistics
+import subprocess
+import sys
+import time
+from pathlib import Path
+from typing import Any
+
+from playwright.sync_api import Page, sync_playwright
+
+from sgwarp.demo.data import ROOM, SCENE_FILE
+from sgwarp.files.atomic import atomic_path
+from sgwarp.ops.launcher import get_threads
+
+WIDTH, HEIGHT = 640, 480
+SOFTWARE_GL = ["--use-angle=swiftshader", "--enable-unsafe-swiftshader", "--ignore-gpu-blocklist", "--no-sandbox"]
+# The page makes an address for the bytes of a picture, and gives it back when the picture is decoded.
+COUNTER = """
+window.decoded = [];
+const made = URL.createObjectURL.bind(URL), given = URL.revokeObjectURL.bind(URL), pictures = new Map();
+URL.createObjectURL = blob => {
+    const url = made(blob);
+    if (blob.type === 'image/jpeg') createImageBitmap(blob).then(image => pictures.set(url, image.height));
+    return url;
+};
+URL.revokeObjectURL = url => { window.decoded.push([performance.now(), url]); given(url); };
+window.heights = () => [...pictures.values()];
+"""
+MOVES = 40  # of the mouse, a second
+
+
+def serve() -> tuple[subprocess.Popen[str], str, float]:
+    """The viewer's process, its address, and the seconds until it said so."""
+    code = "import sys; from sgwarp.cli import main; sys.exit(main())"
+    arguments = ["view", str(ROOM / SCENE_FILE), "--views", str(ROOM), "--port", "18080"]
+    start = time.perf_counter()
+    environment = {**os.environ, "PYTHONUNBUFFERED": "1"}
+    process = subprocess.Popen(
+        [sys.executable, "-c", code, *arguments], stdout=subprocess.PIPE, text=True, env=environment
+    )
+    assert process.stdout is not None
+    for line in process.stdout:
+        found = re.search(r"http://\S+", line)
+        if found:
+            return process, found[0], time.perf_counter() - start
+    raise SystemExit("the viewer did not start")
+
+
+def end(process: subprocess.Popen[str]) -> None:
+    process.terminate()
+    process.wait(timeout=30)
+
+
+def open_page(browser: Any, url: str) -> tuple[Page, float]:
+    """A page whose canvas has the wanted size, and the seconds until its first picture was decoded."""
+    page = browser.new_page(viewport={"width": WIDTH + 324, "height": HEIGHT})
+    page.add_init_script(COUNTER)
+    start = time.perf_counter()
+    page.goto(url)
+    page.wait_for_function("window.decoded.length > 0", timeout=120_000)
+    first = time.perf_counter() - start
+    page.wait_for_timeout(2000)
+    box = page.locator("canvas").first.bounding_box()
+    page.set_viewport_size({"width": round(WIDTH + WIDTH + 324 - box["width"]), "height": HEIGHT})
+    page.wait_for_timeout(2000)
+    box = page.locator("canvas").first.bounding_box()
+    assert (round(box["width"]), round(box["height"])) == (WIDTH, HEIGHT), box
+    return page, first
+
+
+def drag(page: Page, seconds: float) -> dict[str, Any]:
+    """Turn the camera to and fro with the mouse; says when pictures were decoded [ms]."""
+    mouse, middle = page.mouse, (WIDTH / 2, HEIGHT / 2)
+    mouse.move(*middle)
+    mouse.down()
+    begun = page.evaluate("window.decoded = [], performance.now()")
+    start = time.perf_counter()
+    while (passed := time.perf_counter() - start) < seconds:
+        mouse.move(middle[0] + math.sin(passed / 0.7) * WIDTH / 4, middle[1])
+        time.sleep(max(0.0, 1 / MOVES - (time.perf_counter() - start - passed)))
+    ended, times = page.evaluate("[performance.now(), window.decoded.map(one => one[0])]")
+    mouse.up()
+    return {"seconds": (ended - begun) / 1000, "times": times}
+
+
+def measure(seconds: float) -> dict[str, Any]:
+    process, url, _ = serve()  # compiles, and reads files into the system's cache
+    chromium = shutil.which("chromium")
+    if chromium is None:
+        raise SystemExit("no chromium here: apt-get install chromium")
+    with sync_playwright() as started:
+        browser = started.chromium.launch(executable_path=chromium, args=SOFTWARE_GL)
+        open_page(browser, url)[0].close()
+        end(process)
+        process, url, until_served = serve()
+        page, until_picture = open_page(browser, url)
+        drag(page, 2.0)  # finds its size
+        rounds = [drag(page, seconds) for _ in range(3)]
+        heights = page.evaluate("window.heights()")
+        browser.close()
+    end(process)
+    rates = [len(one["times"]) / one["seconds"] for one in rounds]
+    gaps = [b - a for one in rounds for a, b in zip(one["times"], one["times"][1:], strict=False)]
+    return {
+        "gaussians": 100_000,
+        "canvas": [WIDTH, HEIGHT],
+        "threads": get_threads(),
+        "pictures per second while moving": [round(rate, 1) for rate in rates],
+        "median height of moving pictures": statistics.median(heights[len(heights) // 2 :]),
+        "90 % of gaps are shorter than [ms]": round(sorted(gaps)[int(0.9 * len(gaps))], 1),
+        "seconds until it serves": round(until_served, 2),
+        "seconds from opening the page to its first picture": round(until_picture, 2),
+    }
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--seconds", type=float, default=6.0, help="of each of three measurements")
+    parser.add_argument("--out", type=Path, default=Path(__file__).with_name("viewer.json"))
+    options = parser.parse_args()
+    found = measure(options.seconds)
+    with atomic_path(options.out) as temporary:
+        temporary.write_text(json.dumps(found, indent=1) + "\n", encoding="utf-8")
+    print(json.dumps(found, indent=1))
+
+
+if __name__ == "__main__":
+    main()
