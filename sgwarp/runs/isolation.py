@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import sys
 from collections.abc import Callable
 from contextlib import ExitStack
 from functools import wraps
@@ -11,6 +12,25 @@ P = ParamSpec("P")
 R = TypeVar("R")
 
 
+def uncompiled(function: Callable[P, R]) -> Callable[P, R]:
+    """Keep `torch.compile` out of a function: it breaks the graph there once, instead of tracing kernel launches.
+
+    The compiler is not imported for that; it is asked only where somebody else has loaded it.
+    """
+    kept: list[Callable[P, R]] = []
+
+    @wraps(function)
+    def run(*args: P.args, **kwargs: P.kwargs) -> R:
+        compiler = sys.modules.get("torch._dynamo")
+        if compiler is None:
+            return function(*args, **kwargs)
+        if not kept:
+            kept.append(compiler.disable(function))
+        return kept[0](*args, **kwargs)
+
+    return run
+
+
 def isolated(function: Callable[P, R]) -> Callable[P, R]:
     """Make a function the same under `torch.autocast` and `torch.set_default_device` as without them.
 
@@ -18,6 +38,7 @@ def isolated(function: Callable[P, R]) -> Callable[P, R]:
     GPU that belong to the host. Backward passes are not concerned: they run with the precision of their forward pass.
     """
 
+    @uncompiled
     @wraps(function)
     def run(*args: P.args, **kwargs: P.kwargs) -> R:
         import torch

@@ -14,10 +14,12 @@ from sgwarp.ops.splatting import backward, forward, tiles
 from sgwarp.ops.splatting.forward import Rendering, composite_recorded, packed_colors, require_finite
 from sgwarp.ops.splatting.plan import RenderPlan, plan_render
 from sgwarp.ops.splatting.settings import RasterSettings
+from sgwarp.runs.isolation import uncompiled
 from sgwarp.scene import SH_COUNTS, Camera, Gaussians
 from sgwarp.scene.checks import dense
 
 
+@uncompiled
 def rasterize(
     means: Tensor,
     quats: Tensor,
