@@ -19,6 +19,7 @@ MOST_EXHAUSTIVE = 150  # photographs of which every one is compared with every o
 OVERLAP = 12  # photographs after each that it is compared with in a sequence, and at doubling distances
 PHOTOGRAPHS_AT_ONCE, PAIRS_AT_ONCE = 8, 64  # between two reports of the progress
 LARGEST = 1600  # photographs are made this small for features [pixels]
+SMALL, FAINT = 1000, 0.003  # photographs whose sides are shorter have few features: fainter ones count, too [pixels]
 
 
 @dataclass(frozen=True)
@@ -68,6 +69,8 @@ def store_features(
     pycolmap = require_pycolmap()
     options, reader = pycolmap.FeatureExtractionOptions(), pycolmap.ImageReaderOptions()
     options.max_image_size, options.num_threads, options.use_gpu = LARGEST, settings.threads, False
+    if max(read_size(folder / names[0])) < SMALL:
+        options.sift.peak_threshold = FAINT
     reader.camera_model = settings.camera_model
     if camera is not None:
         reader.existing_camera_id = camera
