@@ -187,8 +187,9 @@ def encoder(rooms: dict[str, LabelledRoom], results: Row, save: Callable[[Row], 
     from sgwarp.encoders.cache import CachedMaps, default_folder
 
     room = rooms["rendered"]
-    source = CachedMaps(sg.make_encoder("conse", room.views), default_folder())
-    maps = {view.stem: source.encode(view, view.image()) for view in (*room.views, *room.held_out)}
+    source = CachedMaps(sg.make_encoder("conse"), default_folder())
+    stems = [view.stem for view in (*room.views, *room.held_out)]
+    maps = {stem: source.encode(room.photographs[stem], room.photographs[stem].image()) for stem in stems}
     furniture = room.classes[: room.classes.index("floor")]
     known = (room.of_gaussians >= 0) & (room.of_gaussians < len(furniture))
     rows: Row = {}
