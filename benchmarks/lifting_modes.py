@@ -178,7 +178,8 @@ def measure_time(rooms: dict[str, LabelledRoom], results: Row, save: Callable[[R
             )
             per_step = (seen[1].seconds - seen[0].seconds) / 50
             for step in LOOK_AT:
-                results["rivals"][f"{name}, {what}, {step} steps"]["seconds"] = step * per_step
+                if (key := f"{name}, {what}, {step} steps") in results["rivals"]:
+                    results["rivals"][key]["seconds"] = step * per_step
     save({"seconds": "of the rows with all views, and of a step of each fit"})
 
 
@@ -247,7 +248,8 @@ def plot(results: Row, path: Path) -> None:
                 _mark(panel, row, key.removeprefix(start), "o")
         _mark(panel, results["rivals"][f"{room}, nearest points"], "nearest points", "s")
         for what, color in (("fitted", "tab:red"), ("fitted, 8 channels", "tab:orange")):
-            rows = [results["rivals"][f"{room}, {what}, {step} steps"] for step in LOOK_AT]
+            keys = [f"{room}, {what}, {step} steps" for step in LOOK_AT]
+            rows = [results["rivals"][key] for key in keys if key in results["rivals"]]
             panel.plot([r["seconds"] for r in rows], [r["mIoU"] for r in rows], "^-", color=color, label=what)
         alone = results["rivals"][f"{room}, 2D alone"]["mIoU"]
         panel.axhline(alone, color="grey", linestyle=":", label="2D maps alone")
