@@ -8,7 +8,7 @@ born with a class and whose label images come from rays.
 from __future__ import annotations
 
 import json
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 import numpy as np
@@ -42,6 +42,7 @@ class LabelledRoom:
         truth: Class at every pixel of every view by stem, -1 for none, int64 [h, w].
         classes: Their names.
         of_gaussians: Class of every Gaussian, -1 where nobody knows, int64 [N].
+        photographs: Views at the size of their photographs, by stem; none for generated rooms.
     """
 
     name: str
@@ -51,6 +52,7 @@ class LabelledRoom:
     truth: dict[str, Tensor]
     classes: tuple[str, ...]
     of_gaussians: Tensor
+    photographs: dict[str, View] = field(default_factory=dict)
 
     def noisy(self, view: View) -> FeatureMap:
         """The labels of a view, corrupted; the same each time."""
@@ -108,10 +110,10 @@ def rendered_room(folder: Path, count: int = 30_000, scale: int = 3) -> Labelled
     of_gaussians = vote(gaussians, train, depths, labels, len(classes))
     small = [replace(view, camera=_smaller(view.camera, scale)) for view in views]
     truth = {stem: image[scale // 2 :: scale, scale // 2 :: scale] for stem, image in labels.items()}
-    held_out = small[::HOLD_OUT]
-    return LabelledRoom(
-        "rendered", gaussians, [v for k, v in enumerate(small) if k % HOLD_OUT], held_out, truth, classes, of_gaussians
-    )
+    lifted = [view for k, view in enumerate(small) if k % HOLD_OUT]
+    photographs = {view.stem: view for view in views}
+    rest = (truth, classes, of_gaussians, photographs)
+    return LabelledRoom("rendered", gaussians, lifted, small[::HOLD_OUT], *rest)
 
 
 def _smaller(camera: Camera, scale: int) -> Camera:

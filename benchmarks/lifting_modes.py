@@ -178,7 +178,8 @@ def measure_time(rooms: dict[str, LabelledRoom], results: Row, save: Callable[[R
             )
             per_step = (seen[1].seconds - seen[0].seconds) / 50
             for step in LOOK_AT:
-                results["rivals"][f"{name}, {what}, {step} steps"]["seconds"] = step * per_step
+                if (key := f"{name}, {what}, {step} steps") in results["rivals"]:
+                    results["rivals"][key]["seconds"] = step * per_step
     save({"seconds": "of the rows with all views, and of a step of each fit"})
 
 
@@ -187,8 +188,9 @@ def encoder(rooms: dict[str, LabelledRoom], results: Row, save: Callable[[Row], 
     from sgwarp.encoders.cache import CachedMaps, default_folder
 
     room = rooms["rendered"]
-    source = CachedMaps(sg.make_encoder("conse", room.views), default_folder())
-    maps = {view.stem: source.encode(view, view.image()) for view in (*room.views, *room.held_out)}
+    source = CachedMaps(sg.make_encoder("conse"), default_folder())
+    stems = [view.stem for view in (*room.views, *room.held_out)]
+    maps = {stem: source.encode(room.photographs[stem], room.photographs[stem].image()) for stem in stems}
     furniture = room.classes[: room.classes.index("floor")]
     known = (room.of_gaussians >= 0) & (room.of_gaussians < len(furniture))
     rows: Row = {}
@@ -246,7 +248,8 @@ def plot(results: Row, path: Path) -> None:
                 _mark(panel, row, key.removeprefix(start), "o")
         _mark(panel, results["rivals"][f"{room}, nearest points"], "nearest points", "s")
         for what, color in (("fitted", "tab:red"), ("fitted, 8 channels", "tab:orange")):
-            rows = [results["rivals"][f"{room}, {what}, {step} steps"] for step in LOOK_AT]
+            keys = [f"{room}, {what}, {step} steps" for step in LOOK_AT]
+            rows = [results["rivals"][key] for key in keys if key in results["rivals"]]
             panel.plot([r["seconds"] for r in rows], [r["mIoU"] for r in rows], "^-", color=color, label=what)
         alone = results["rivals"][f"{room}, 2D alone"]["mIoU"]
         panel.axhline(alone, color="grey", linestyle=":", label="2D maps alone")

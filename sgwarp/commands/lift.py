@@ -58,7 +58,7 @@ class Lift(SceneOptions):
     ridge: float = 0.0
     """How strongly mode solve keeps to the weighted mean; 0 chooses it by views that are held out."""
 
-    iterations: int = 8
+    iterations: int = 4
     """Steps of mode solve."""
 
     reliability: bool = False

@@ -33,7 +33,7 @@ class LiftSettings:
     passes: int = 4
     smoothing: float = 1e-3
     ridge: float = 0.0
-    iterations: int = 8
+    iterations: int = 4
     reliability: bool = False
     fill: int = 0
 
