@@ -231,10 +231,11 @@ def draw_ablation(ablation: Ablation, path: Path) -> bool:
 
     figure = Figure(figsize=(7.5, 4.8), dpi=140, layout="constrained")
     axes, name = figure.subplots(), ablation.profile.headline[0]
+    # A log scale has no zero: what takes no time stands at its left edge.
+    least = 0.3 * min((trial.seconds for trial in ablation.trials if trial.seconds > 0), default=1.0)
     for axis in dict.fromkeys(trial.variant.axis for trial in ablation.trials):
         trials = [t for t in ablation.trials if t.variant.axis == axis and t.found is not None]
-        # A log scale has no zero: what takes no time stands at its left edge.
-        seconds = [max(t.seconds, 1e-3) for t in trials]
+        seconds = [max(t.seconds, least) for t in trials]
         values = [100 * t.found.figures.get(name, float("nan")) for t in trials if t.found]
         axes.plot(seconds, values, "o", label=axis)
         for x, y, trial in zip(seconds, values, trials, strict=True):

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import shutil
 from collections.abc import Sequence
+from contextlib import suppress
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -118,12 +119,16 @@ def evaluate_scene(
     before = read_result(folder / FILE, identity)
     if before is not None:
         return before, True
-    shutil.rmtree(folder, ignore_errors=True)
-    folder.mkdir(parents=True, exist_ok=True)
     log, result = RunLog(device=settings.device), SceneResult(name)
     reset_peak()
     case = profile.make(scene, settings, profile.split, log)
-    profile.score(case, result, folder)
+    shutil.rmtree(folder, ignore_errors=True)
+    folder.mkdir(parents=True, exist_ok=True)
+    try:
+        profile.score(case, result, folder)
+    except InputError:
+        _remove(folder, out)
+        raise
     result.seconds = {stage: round(value, 4) for stage, value in log.stages.items()}
     result.peak_memory, result.gaussians = peak(), len(case.gaussians)
     result.bytes_per_gaussian = case.bytes_per_gaussian
@@ -132,6 +137,14 @@ def evaluate_scene(
     result.sheets = [f"scenes/{folder.name}/{sheet}" for sheet in result.sheets]
     write_result(folder / FILE, result, identity)
     return result, False
+
+
+def _remove(folder: Path, out: Path) -> None:
+    """Remove what a scene that failed has left, and the folders above it up to `out` if nothing else is in them."""
+    shutil.rmtree(folder, ignore_errors=True)
+    with suppress(OSError):
+        for place in (folder.parent, out):
+            place.rmdir()
 
 
 def choose_scenes(

@@ -73,6 +73,7 @@ def test_rows_are_the_evaluations_with_one_option_changed(rooms, tmp_path):
     assert {path: path.stat().st_mtime_ns for path in records} == records
 
 
+@pytest.mark.slow
 def test_inputs_train_a_network_each(rooms, tmp_path):
     out = tmp_path / "out"
     assert evaluate(rooms, out, "--ablate", "inputs", "--epochs", "1") == 0

@@ -389,6 +389,7 @@ def test_parts_that_nobody_named_are_asked_for(rooms, tmp_path, capsys):
     arguments = ["--data", str(tmp_path), "--out", str(tmp_path / "out"), "--encoder", f"files:{tmp_path}/maps"]
     assert main(["evaluate", "parts", *arguments]) == 2
     assert "--classes" in capsys.readouterr().err
+    assert not (tmp_path / "out").exists()
 
 
 def test_moving_scene_end_to_end(tmp_path):

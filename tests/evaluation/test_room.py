@@ -157,7 +157,7 @@ def test_noise_makes_it_worse_and_2d_alone_is_the_noise(rooms, tmp_path):
 def test_what_is_refused(rooms, tmp_path, capsys, options, message):
     assert main(["evaluate", "room", "--data", str(rooms), "--out", str(tmp_path / "out"), *options]) == 2
     assert message in capsys.readouterr().err
-    assert not (tmp_path / "out" / "results.json").exists()
+    assert not (tmp_path / "out").exists()
 
 
 def test_a_folder_without_scenes_is_refused(tmp_path, capsys):
