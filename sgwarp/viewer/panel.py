@@ -315,7 +315,7 @@ class Panel:
         options = ("-", *(f"{one.id} {one.name} {one.score:.2f}" for one in ranked))
         if tuple(self._top.options) != options:
             self._top.options = options
-        return _table([(f"{one.id} {one.name}", one.score) for one in ranked[:LISTED]])
+        return _table([(one.name, one.score) for one in ranked[:LISTED]])
 
 
 def _color(values: Any) -> ops.Vector:
