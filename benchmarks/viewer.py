@@ -4,12 +4,14 @@
 
 `sgwarp view` serves the demo's room, 100,000 Gaussians, in a process of its own. Chromium, with GL in software on the
 same cores, shows a canvas of 640 x 480 and turns the camera. A picture counts when the page has decoded it. Kernels are
-compiled before the clock starts. Needs Playwright and Debian's chromium.
+compiled before the clock starts. Once the viewer chooses the size of moving pictures, once all have 480 rows. The
+processor time of a picture says what a busy machine hides: how many there could be. Needs Playwright and chromium.
 """
 
 from __future__ import annotations
 
 import argparse
+import itertools
 import json
 import math
 import os
@@ -29,6 +31,7 @@ from sgwarp.files.atomic import atomic_path
 from sgwarp.ops.launcher import get_threads
 
 WIDTH, HEIGHT = 640, 480
+LOAD = round(os.getloadavg()[0], 1)  # of the machine before anything is measured
 SOFTWARE_GL = ["--use-angle=swiftshader", "--enable-unsafe-swiftshader", "--ignore-gpu-blocklist", "--no-sandbox"]
 # The page makes an address for the bytes of a picture, and gives it back when the picture is decoded.
 COUNTER = """
@@ -45,9 +48,11 @@ window.heights = () => [...pictures.values()];
 MOVES = 40  # of the mouse, a second
 
 
-def serve() -> tuple[subprocess.Popen[str], str, float]:
-    """The viewer's process, its address, and the seconds until it said so."""
+def serve(height: int = 0) -> tuple[subprocess.Popen[str], str, float]:
+    """The viewer's process, its address, and the seconds until it said so; with a height, for all moving pictures."""
     code = "import sys; from sgwarp.cli import main; sys.exit(main())"
+    if height:
+        code = f"from sgwarp.viewer import pace; pace.SIZES = len(pace.SIZES) * ({height},); {code}"
     arguments = ["view", str(ROOM / SCENE_FILE), "--views", str(ROOM), "--port", "18080"]
     start = time.perf_counter()
     environment = {**os.environ, "PYTHONUNBUFFERED": "1"}
@@ -84,6 +89,25 @@ def open_page(browser: Any, url: str) -> tuple[Page, float]:
     return page, first
 
 
+def processor_seconds(root: int) -> float:
+    """Of a process and all that it has started and that still run."""
+    parents, spent = {}, {}
+    for folder in Path("/proc").iterdir():
+        try:
+            fields = (folder / "stat").read_text().rpartition(")")[2].split()
+        except (OSError, NotADirectoryError):  # no process, or one that has just ended
+            continue
+        number = int(folder.name)
+        parents[number], spent[number] = int(fields[1]), (int(fields[11]) + int(fields[12])) / os.sysconf("SC_CLK_TCK")
+    total = 0.0
+    for number in spent:
+        above = number
+        while above and above != root:
+            above = parents.get(above, 0)
+        total += spent[number] if above == root else 0.0
+    return total
+
+
 def drag(page: Page, seconds: float) -> dict[str, Any]:
     """Turn the camera to and fro with the mouse; says when pictures were decoded [ms]."""
     mouse, middle = page.mouse, (WIDTH / 2, HEIGHT / 2)
@@ -99,34 +123,42 @@ def drag(page: Page, seconds: float) -> dict[str, Any]:
     return {"seconds": (ended - begun) / 1000, "times": times}
 
 
+def measure_rate(browser: Any, seconds: float, height: int = 0) -> dict[str, Any]:
+    """Pictures while moving, of the size that the viewer chooses or of one height."""
+    process, url, until_served = serve(height)
+    page, until_picture = open_page(browser, url)
+    drag(page, min(2.0, seconds))  # finds its size
+    before = processor_seconds(process.pid), processor_seconds(os.getpid())
+    rounds = [drag(page, seconds) for _ in range(3)]
+    server = processor_seconds(process.pid) - before[0]
+    page_and_driver = processor_seconds(os.getpid()) - before[1] - server
+    heights = page.evaluate("window.heights()")
+    page.close()
+    end(process)
+    count = sum(len(one["times"]) for one in rounds)
+    gaps = sorted(b - a for one in rounds for a, b in itertools.pairwise(one["times"]))
+    return {
+        "pictures per second while moving": [round(len(one["times"]) / one["seconds"], 1) for one in rounds],
+        "median height of moving pictures": statistics.median(heights[len(heights) // 2 :]),
+        "90 % of gaps are shorter than [ms]": round(gaps[int(0.9 * len(gaps))], 1) if gaps else None,
+        "processor time of the viewer per picture [ms]": round(1000 * server / max(count, 1), 1),
+        "processor time of browser and driver per picture [ms]": round(1000 * page_and_driver / max(count, 1), 1),
+        "seconds until it serves": round(until_served, 2),
+        "seconds from opening the page to its first picture": round(until_picture, 2),
+    }
+
+
 def measure(seconds: float) -> dict[str, Any]:
-    process, url, _ = serve()  # compiles, and reads files into the system's cache
     chromium = shutil.which("chromium")
     if chromium is None:
         raise SystemExit("no chromium here: apt-get install chromium")
     with sync_playwright() as started:
         browser = started.chromium.launch(executable_path=chromium, args=SOFTWARE_GL)
-        open_page(browser, url)[0].close()
-        end(process)
-        process, url, until_served = serve()
-        page, until_picture = open_page(browser, url)
-        drag(page, 2.0)  # finds its size
-        rounds = [drag(page, seconds) for _ in range(3)]
-        heights = page.evaluate("window.heights()")
+        measure_rate(browser, 0.5)  # compiles, and reads files into the system's cache
+        found = {"size chosen": measure_rate(browser, seconds), "480 rows": measure_rate(browser, seconds, HEIGHT)}
         browser.close()
-    end(process)
-    rates = [len(one["times"]) / one["seconds"] for one in rounds]
-    gaps = [b - a for one in rounds for a, b in zip(one["times"], one["times"][1:], strict=False)]
-    return {
-        "gaussians": 100_000,
-        "canvas": [WIDTH, HEIGHT],
-        "threads": get_threads(),
-        "pictures per second while moving": [round(rate, 1) for rate in rates],
-        "median height of moving pictures": statistics.median(heights[len(heights) // 2 :]),
-        "90 % of gaps are shorter than [ms]": round(sorted(gaps)[int(0.9 * len(gaps))], 1),
-        "seconds until it serves": round(until_served, 2),
-        "seconds from opening the page to its first picture": round(until_picture, 2),
-    }
+    about = {"gaussians": 100_000, "canvas": [WIDTH, HEIGHT], "threads": get_threads()}
+    return {**about, "load average before and after": [LOAD, round(os.getloadavg()[0], 1)], **found}
 
 
 def main() -> None:

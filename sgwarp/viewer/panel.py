@@ -23,6 +23,7 @@ from sgwarp.viewer.tab import Tab
 
 logger = logging.getLogger("sgwarp")
 TYPED = 0.4  # seconds after the last letter until a query is asked
+LISTED = 5  # best objects in the panel; the list to choose from is longer
 SHOWN = 6.0  # seconds that a message stays
 NOTHING = "Click at an object, or draw a rectangle with Shift held."
 HINTS = {
@@ -150,7 +151,7 @@ class Panel:
             visible=False,
         )
         self._legend = gui.add_html("")
-        self._top = gui.add_dropdown("Best objects", ("-",), visible=False)
+        self._top = gui.add_dropdown("Select object", ("-",), visible=False)
         self._on(self._top, self._choose)
         self._button("Select what was found", lambda: self._tell_found(self.tab.select_found()))
         if bench.asker.sees_pictures:
@@ -296,17 +297,17 @@ class Panel:
             if self._mode.value != tab.look.mode:
                 self._mode.value = tab.look.mode
             self._info.content = NOTHING if tab.found is None else _plain(tab.found.sentence)
-            self._legend.content = _legend(tab.legend())
-            self._refresh_answers()
+            self._legend.content = _legend(tab.legend()) + self._refresh_answers()
         finally:
             self._filling = False
 
-    def _refresh_answers(self) -> None:
+    def _refresh_answers(self) -> str:
+        """Histogram and best objects; these also as HTML."""
         answers = self.tab.answers
         self._histogram.visible = answers is not None
         if answers is None:
             self._top.visible = False
-            return
+            return ""
         centers, counts = answers.histogram()
         self._histogram.data = (centers.numpy(), np.log10(1.0 + counts.numpy()))
         ranked = answers.rank(self.tab.bench.materials.instances)
@@ -314,6 +315,7 @@ class Panel:
         options = ("-", *(f"{one.id} {one.name} {one.score:.2f}" for one in ranked))
         if tuple(self._top.options) != options:
             self._top.options = options
+        return _table([(one.name, one.score) for one in ranked[:LISTED]])
 
 
 def _color(values: Any) -> ops.Vector:
@@ -333,6 +335,16 @@ def _legend(rows: list[tuple[str, str]]) -> str:
         for name, color in rows[:32]
     ]
     return f'<div style="padding:0 1em;font-size:0.85em">{"".join(lines)}</div>' if lines else ""
+
+
+def _table(rows: list[tuple[str, float]]) -> str:
+    """Names with scores, and a bar of each score."""
+    lines = [
+        f'<tr><td>{html.escape(name)}</td><td style="width:40%"><div style="height:0.6em;background:#e8590c;'
+        f'width:{100 * min(max(score, 0.0), 1.0):.0f}%"></div></td><td>{score:.2f}</td></tr>'
+        for name, score in rows
+    ]
+    return f'<table style="margin:0.3em 1em;width:90%;font-size:0.85em">{"".join(lines)}</table>' if lines else ""
 
 
 def _plain(text: str) -> str:

@@ -21,6 +21,7 @@ from sgwarp.scene import View
 from sgwarp.scene.extent import camera_extent
 from sgwarp.viewer import bounds
 from sgwarp.viewer.guard import LOOPBACK, Gate, gated, guard_messages, let_go_quietly
+from sgwarp.viewer.modes import HIGHLIGHT
 from sgwarp.viewer.panel import Panel
 from sgwarp.viewer.screen import Canvas
 from sgwarp.viewer.streaming import Stream, Streamer
@@ -277,7 +278,9 @@ class Session:
             fov=_fov(view),
             aspect=camera.width / camera.height,
             scale=size,
-            color=(255, 140, 0),
+            color=HIGHLIGHT,
+            thickness=1.5,  # one in world units would fill the picture of a camera that stands there
+            thickness_units="screen",
             wxyz=SO3.from_matrix(camera.world_to_camera[:3, :3].T.numpy()).wxyz,
             position=camera.position.numpy(),
         )

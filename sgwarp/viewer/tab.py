@@ -165,21 +165,19 @@ class Tab:
         """Select the object at a place of the picture, from 0 to 1 on either side; again: its part there."""
         camera = self._require_camera()
         pixel = bounds.pixel(position, camera)
-        state, context = self.bench.state, self.bench.session.context
-        revision = self.bench.scene(self.look.moment).revision
-        before = self.found if self._selected_at == revision else None
-        found = clicks.click(state, context, self.bench.asker, camera, pixel, before)
-        self._select(found, revision)
+        scene, context = self.bench.scene(self.look.moment), self.bench.session.context
+        before = self.found if self._selected_at == scene.revision else None
+        found = clicks.click(scene.state, context, self.bench.asker, camera, pixel, before)
+        self._select(found, scene.revision)
         return found
 
     def select_rectangle(self, first: Any, second: Any) -> Found:
         """Select what lies in a rectangle of the picture."""
         camera = self._require_camera()
         corners = bounds.pixel(first, camera), bounds.pixel(second, camera)
-        state = self.bench.state
-        revision = self.bench.scene(self.look.moment).revision
-        found = Found(clicks.in_rectangle(state, camera, corners, self.look.through))
-        self._select(found, revision)
+        scene = self.bench.scene(self.look.moment)
+        found = Found(clicks.in_rectangle(scene.state, camera, corners, self.look.through))
+        self._select(found, scene.revision)
         return found
 
     def select_found(self, query: Any = 0) -> Found:
@@ -202,7 +200,7 @@ class Tab:
         scene = self.bench.scene(self.look.moment)
         chosen = instances.members(number)[scene.rows]
         level = instances.table[number - 1].level
-        self._select(clicks.describe(self.bench.state, self.bench.asker, instances, chosen, level), scene.revision)
+        self._select(clicks.describe(scene.state, self.bench.asker, instances, chosen, level), scene.revision)
         assert self.found is not None
         return self.found
 

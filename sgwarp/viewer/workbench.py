@@ -67,6 +67,11 @@ class Scene:
     copies: Tensor
     revision: int
 
+    @property
+    def state(self) -> EditState:
+        """The same for what selects."""
+        return EditState(self.gaussians, self.rows, self.copies, torch.zeros_like(self.copies, dtype=torch.bool))
+
 
 @dataclass
 class Workbench:
@@ -124,7 +129,8 @@ class Workbench:
             raise InputError(f"time: expected 0 to {self.frames - 1}, got {moment}")
         gaussians = self._frame(moment)
         rows = torch.arange(len(gaussians), device=gaussians.device)
-        return Scene(gaussians, rows, torch.zeros(len(rows), dtype=torch.int32), self._revision * self.frames + moment)
+        copies = torch.zeros_like(rows, dtype=torch.int32)
+        return Scene(gaussians, rows, copies, self._revision * self.frames + moment)
 
     def _frame(self, moment: int) -> Gaussians:
         sequence = self.materials.sequence

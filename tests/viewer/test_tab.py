@@ -496,7 +496,9 @@ def test_frames_of_a_moving_scene(stage, tmp_path):
     assert not np.array_equal(pixels(tab), first)
     with pytest.raises(InputError, match="time"):
         tab.set_moment(3)
-    tab.select_rectangle((0.4, 0.4), (0.6, 0.6))
+    place = place_of(tab.camera, (LAMP[0] + 0.4, *LAMP[1:]))
+    there = tab.select_rectangle((place[0] - 0.02, place[1] - 0.02), (place[0] + 0.02, place[1] + 0.02))
+    assert set(stage.classes[there.selected].tolist()) == {3}, "where the lamp is now"
     with pytest.raises(InputError, match="moving scene"):
         tab.edit(ops.Remove())
 
