@@ -93,9 +93,11 @@ def processor_seconds(root: int) -> float:
     """Of a process and all that it has started and that still run."""
     parents, spent = {}, {}
     for folder in Path("/proc").iterdir():
+        if not folder.name.isdecimal():
+            continue
         try:
             fields = (folder / "stat").read_text().rpartition(")")[2].split()
-        except (OSError, NotADirectoryError):  # no process, or one that has just ended
+        except OSError:  # it has just ended
             continue
         number = int(folder.name)
         parents[number], spent[number] = int(fields[1]), (int(fields[11]) + int(fields[12])) / os.sysconf("SC_CLK_TCK")

@@ -182,12 +182,12 @@ class Session:
 
     def __init__(self, viewer: Viewer, client: Any) -> None:
         self.viewer, self.client = viewer, client
+        let_go_quietly(client)
         self.tab = Tab(viewer.bench)
         self.canvas = Canvas(client, lambda message: self.panel.tell(message, wrong=True))
         self.stream = Stream(self.canvas, self.tab.shot)
         self._frustums: list[Any] = []
         self.panel = Panel(client, self.tab, self.changed, self.draw_splats, self.aim, self.show_cameras)
-        let_go_quietly(client)
         viewer.streamer.add(self.stream)
         self._listen()
         self.moved()
