@@ -7,14 +7,14 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from sgwarp.commands.options import SceneOptions, check_name, find_views, load_on
+from sgwarp.commands.options import SceneOptions, check_name, find_view, find_views, load_on, place_views
 from sgwarp.errors import InputError
 
 if TYPE_CHECKING:
     from sgwarp.apps.editing.picker import EditContext, EditState
     from sgwarp.apps.editing.script import EditStep
     from sgwarp.runs.log import RunLog
-    from sgwarp.scene import Gaussians
+    from sgwarp.scene import Gaussians, View
 
 
 @dataclass(kw_only=True)
@@ -84,6 +84,13 @@ class Edit(SceneOptions):
     views: Path | None = None
     """Cameras, for click: and for the picture."""
 
+    transform: Path | None = None
+    """Where the views lie in another world than the scene: the transform between them, such as the
+    dataparser_transforms.json of the trainer that moved the scene."""
+
+    images: str | None = None
+    """Name of a COLMAP model's folder of photographs, if it is not `images` nor the only one that holds them."""
+
     view: str | None = None
     """View to draw before and after from, to {out}.png; needs --views."""
 
@@ -100,6 +107,9 @@ class Edit(SceneOptions):
             gaussians = self.load_scene(log)
             steps = self._steps() if self.script is None else self._replayed(load_script(self.script, gaussians))
             context = self._context(gaussians, log)
+            drawn = None
+            if self.views is not None and self.view is not None:
+                drawn = find_view(context.views, self.view, self.views)
             with log.stage("edit"):
                 state = edit(gaussians, steps, context)
             columns = None if self.plain else gaussians.extras
@@ -108,7 +118,7 @@ class Edit(SceneOptions):
                 self._write(state, columns)
                 save_script(steps, gaussians, script)
             log.outputs += [str(self.out), str(script)]
-            self._draw(gaussians, state.gaussians, log)
+            self._draw(gaussians, state.gaussians, drawn, log)
             changed = len(gaussians) - len(state.gaussians)
             print(f"{len(steps)} steps; {len(gaussians)} Gaussians before, {len(state.gaussians)} after")
             log.leave_out("gaussians_removed", max(changed, 0))
@@ -176,7 +186,7 @@ class Edit(SceneOptions):
                 semantics = load_on(self.semantics, gaussians)
             if self.instances is not None:
                 instances = load_instances(self.instances, gaussians)
-            views: Sequence[Any] = find_views(self.views) if self.views is not None else ()
+            views = self._views(gaussians)
         if semantics is not None and semantics.labels is None:
             from sgwarp.encoders.registry import text_encoder_for
             from sgwarp.io.store import read_notes
@@ -187,16 +197,21 @@ class Edit(SceneOptions):
                 encoder = text_encoder_for(semantics.space, name, self.device)
         return EditContext(semantics, encoder, instances, views)
 
-    def _draw(self, before: Gaussians, after: Gaussians, log: RunLog) -> None:
+    def _views(self, gaussians: Gaussians) -> Sequence[View]:
+        """Views in the world of the scene, for clicks and the picture."""
+        if self.views is None:
+            return ()
+        return place_views(gaussians, self.scene, find_views(self.views, images=self.images), self.transform)
+
+    def _draw(self, before: Gaussians, after: Gaussians, view: View | None, log: RunLog) -> None:
         """The view before and after, side by side."""
-        if self.view is None or self.views is None:
+        if view is None:
             return
         import torch
 
         from sgwarp.files.images import write_rgb
         from sgwarp.rendering.renderer import render
 
-        (view,) = find_views(self.views, self.view)
         picture = self.out.with_name(f"{self.out.stem}.png")
         with log.stage("draw"):
             pair = [render(scene, view.camera).clamp(0, 1).cpu() for scene in (before, after)]

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
-from sgwarp.commands.options import SceneOptions, check_folder, check_name, find_views, photograph
+from sgwarp.commands.options import SceneOptions, check_folder, check_name, find_views, photograph, place_views
 from sgwarp.errors import InputError
 from sgwarp.runs.progress import show_progress
 
@@ -22,6 +22,13 @@ class Instances(SceneOptions):
 
     views: Path
     """Posed photographs: a folder with transforms.json or a COLMAP model."""
+
+    transform: Path | None = None
+    """Where the views lie in another world than the scene: the transform between them, such as the
+    dataparser_transforms.json of the trainer that moved the scene."""
+
+    images: str | None = None
+    """Name of a COLMAP model's folder of photographs, if it is not `images` nor the only one that holds them."""
 
     masks: str
     """Where masks come from: files:DIR (id images), masks:DIR, deva:DIR, graph, sam:PATH, vlpart:DIR, ...;
@@ -78,7 +85,9 @@ class Instances(SceneOptions):
 
             gaussians = self.load_scene(log)
             semantics = self._semantics(gaussians, log)
-            views = find_views(self.views)
+            views = find_views(self.views, images=self.images)
+            with log.stage("compare"):
+                views = place_views(gaussians, self.scene, views, self.transform)
             with log.stage("load_masks"):
                 source = make_mask_source(self.masks, views, self.device)
             with show_progress("instances") as progress:
@@ -98,7 +107,7 @@ class Instances(SceneOptions):
             log.error["instances"] = len(found.table)
             log.error["bytes_per_gaussian"] = self.out.stat().st_size / len(gaussians)
             self._write_scene(gaussians, found, log)
-            self._render(gaussians, found, log)
+            self._render(gaussians, views, found, log)
 
     def _check(self) -> None:
         """Refuse what cannot be written or does not go together, before the work is done."""
@@ -171,8 +180,8 @@ class Instances(SceneOptions):
             save_instance_scene(gaussians.to("cpu"), found, self.ply)
         log.outputs.append(str(self.ply))
 
-    def _render(self, gaussians: Gaussians, found: InstanceMap, log: RunLog) -> None:
-        """Id maps and pictures of the views asked for."""
+    def _render(self, gaussians: Gaussians, views: list[View], found: InstanceMap, log: RunLog) -> None:
+        """Id maps and pictures of the views asked for, or of those that gave the masks."""
         if self.render_out is None:
             return
         import numpy as np
@@ -182,7 +191,9 @@ class Instances(SceneOptions):
 
         if len(found.table) > 65535:
             raise InputError(f"--render-out: {len(found.table)} instances do not fit 16-bit images")
-        views = find_views(self.render_views or self.views)
+        if self.render_views is not None:
+            views = find_views(self.render_views, images=self.images)
+            views = place_views(gaussians, self.scene, views, self.transform)
         with show_progress("render") as progress:
             progress(0, len(views), "")
             for done, view in enumerate(views, start=1):

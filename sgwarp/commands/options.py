@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import logging
 import os
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -176,10 +176,17 @@ def find_views(
     from sgwarp.io.views import load_views
 
     views = load_views(folder, images, photographs)
-    if stem is None:
-        return views
-    chosen = [view for view in views if view.stem == stem]
-    if not chosen:
+    return views if stem is None else [find_view(views, stem, folder)]
+
+
+def find_view(views: Sequence[View], stem: str, folder: Path) -> View:
+    """The view of a folder that is named `stem`.
+
+    Raises:
+        InputError: There is none of that name.
+    """
+    chosen = next((view for view in views if view.stem == stem), None)
+    if chosen is None:
         some = ", ".join(view.stem for view in views[:5])
         raise InputError(f"{folder}: has no view '{stem}'; its {len(views)} views are named {some}, ...")
     return chosen

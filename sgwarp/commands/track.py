@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
@@ -17,7 +18,10 @@ if TYPE_CHECKING:
     from sgwarp.apps.tracking.answers import Questions
     from sgwarp.apps.tracking.tracker import Tracker
     from sgwarp.io.moving_views import MovingViews
+    from sgwarp.io.sequences import GaussianSequence
     from sgwarp.runs.log import RunLog
+
+logger = logging.getLogger("sgwarp")
 
 
 @dataclass(kw_only=True)
@@ -36,6 +40,10 @@ class Track(Options):
 
     encoder: str = "conse"
     """Where the 2D semantics come from, as for `sgwarp lift`; files:DIR are files in one folder per frame."""
+
+    transform: Path | None = None
+    """Where the cameras lie in another world than the scene: the transform between them, such as the
+    dataparser_transforms.json of the trainer that moved the scene."""
 
     split: Literal["train", "test"] = "train"
     """Which cameras of Dynamic3DGaussians are lifted."""
@@ -114,6 +122,8 @@ class Track(Options):
             masks = None
             if self.mask_views is not None:
                 masks = load_moving_views(self.mask_views, self.mask_split, self.photographs)
+            with log.stage("compare"):
+                views, masks = self._placed(sequence, views, masks)
             with log.stage("load_encoder"):
                 tracker, questions = self._prepare(views, log)
             output = Output(self.out, masks, self.features, self.pictures, settings=self._settings())
@@ -125,6 +135,19 @@ class Track(Options):
                     progress=progress,
                 )
             self._summarize(tracks, log)
+
+    def _placed(
+        self, sequence: GaussianSequence, views: MovingViews, masks: MovingViews | None
+    ) -> tuple[MovingViews, MovingViews | None]:
+        """The cameras in the world of the scene; says so where the photographs of the first frame do not match it."""
+        from sgwarp.io.moving_views import MovedViews
+        from sgwarp.rendering.agreement import find_placement
+
+        first = sequence.frame(0).gaussians.to(self.device)
+        matrix = find_placement(first, self.scene, [one.view for one in views.at(0)], self.transform)
+        if matrix is None:
+            return views, masks
+        return MovedViews(views, matrix), None if masks is None else MovedViews(masks, matrix)
 
     def _prepare(self, views: MovingViews, log: RunLog) -> tuple[Tracker, Questions]:
         from sgwarp.apps.tracking.answers import Questions
@@ -163,9 +186,13 @@ class Track(Options):
         names = ("encoder", "split", "classes", "text", "forgetting", "patience", "change", "foreground", "scoring")
         chosen = {name: getattr(self, name) for name in (*names, "temperature", "unknown_below", "photographs")}
         masks = None if self.mask_views is None else [str(self.mask_views.resolve()), self.mask_split]
+        chosen["transform"] = None if self.transform is None else str(self.transform.resolve())
         return {**chosen, "mask_views": masks, "scene": str(self.scene.resolve()), "views": str(self.views.resolve())}
 
     def _summarize(self, tracks: dict[str, Any], log: RunLog) -> None:
+        for name in class_names(self.classes) if self.classes is not None else ():
+            if not any(tracks["objects"][name]["gaussians"]):
+                logger.warning("--classes: '%s' was found in no frame; check the name", name)
         known = [value for value in tracks["switches"] if value is not None]
         log.error["gaussians_that_changed_object_per_frame"] = sum(known) / max(1, len(known))
         log.error["share_of_tiles_left_out"] = sum(tracks["left_out"]) / len(tracks["left_out"])

@@ -9,12 +9,14 @@ from typing import Any, Literal, Protocol
 
 import numpy as np
 import torch
+from numpy.typing import NDArray
 
 from sgwarp.errors import InputError
 from sgwarp.files.documents import read_json
 from sgwarp.io.colmap import find_model
 from sgwarp.io.stems import IMAGE_SUFFIXES
 from sgwarp.io.views import TRANSFORMS, load_views
+from sgwarp.io.world_transforms import moved_views
 from sgwarp.scene import Camera, View
 
 Split = Literal["train", "test"]
@@ -70,6 +72,23 @@ def load_moving_views(path: str | os.PathLike[str], split: Split = "train", phot
         if folders:
             return FolderViews(folders, photographs)
     return StillViews(path, photographs)
+
+
+@dataclass(frozen=True, eq=False)
+class MovedViews:
+    """Cameras after a similarity transform of the world, float64 [4, 4]."""
+
+    views: MovingViews
+    matrix: NDArray[np.float64]
+
+    @property
+    def frames(self) -> int | None:
+        return self.views.frames
+
+    def at(self, frame: int) -> list[FrameView]:
+        found = self.views.at(frame)
+        moved = moved_views([one.view for one in found], self.matrix)
+        return [replace(one, view=view) for one, view in zip(found, moved, strict=True)]
 
 
 class StillViews:

@@ -314,6 +314,8 @@ def view(tensor: Tensor, dtype: Any) -> Any:
     """The tensor's memory as a Warp array, without a copy; vector types take the last dimension."""
     if tensor.is_cuda:
         require_warp(tensor.device)
+    if not tensor.numel():  # torch calls any strides of an empty tensor contiguous, Warp does not
+        tensor = tensor.new_empty(tensor.shape)
     return wp.from_torch(tensor.detach(), dtype=dtype, requires_grad=False)
 
 

@@ -112,9 +112,14 @@ def confidence(scores: Tensor, temperature: float) -> Tensor:
     Raises:
         InputError: The temperature is not positive and finite.
     """
+    require_temperature(temperature)
+    return torch.softmax(scores / temperature, dim=-1)
+
+
+def require_temperature(temperature: float) -> None:
+    """Raise InputError unless a softmax can be divided by it."""
     if not 1e-6 <= temperature < float("inf"):
         raise InputError(f"temperature: expected a number from 1e-6 on, got {temperature}")
-    return torch.softmax(scores / temperature, dim=-1)
 
 
 @isolated
@@ -151,8 +156,10 @@ def class_votes(
 
     Raises:
         InputError: No classes, or an encoder missing, where one is needed; a class that is not among the lifted labels;
-            predicted semantics of another scene or space.
+            a temperature that is not positive and finite; predicted semantics of another scene or space.
     """
+    if temperature is not None:
+        require_temperature(temperature)
     seen = seen_by(semantics, predicted, ensemble)
     if semantics.labels is not None:
         return _label_votes(semantics, classes, predicted, ensemble)

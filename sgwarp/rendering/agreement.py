@@ -16,7 +16,7 @@ from torch import Tensor
 from sgwarp.errors import InputError
 from sgwarp.io.world_transforms import moved_views, read_world_transform
 from sgwarp.rendering.renderer import render
-from sgwarp.scene import Gaussians, View
+from sgwarp.scene import Camera, Gaussians, View
 
 logger = logging.getLogger("sgwarp")
 COMPARED = 4  # views, evenly spread
@@ -57,16 +57,42 @@ def compare(gaussians: Gaussians, views: Sequence[View]) -> Agreement:
         except InputError:
             continue
         camera = view.camera.resized(photograph.shape[0], photograph.shape[1])
-        renderings.append(_normalized(render(gaussians, camera).clamp(0, 1).cpu().numpy()))
-        photographs.append(_normalized(photograph))
+        renderings.append(_Rendering.of(gaussians, camera))
+        photographs.append(photograph)
     if not photographs:
         return Agreement(float("nan"), 0, float("nan"))
-    own = [_correlation(a, b) for a, b in zip(renderings, photographs, strict=True)]
+    own = [a.correlation(b) for a, b in zip(renderings, photographs, strict=True)]
     others = [
-        max((_correlation(a, b) for j, b in enumerate(photographs) if j != i), default=-1.0)
+        max((a.correlation(b) for j, b in enumerate(photographs) if j != i), default=-1.0)
         for i, a in enumerate(renderings)
     ]
     return Agreement(float(np.mean(own)), len(own), float(np.mean(others)))
+
+
+@dataclass(frozen=True, eq=False)
+class _Rendering:
+    """A rendering over black, float32 [h, w, 3], and the share of the background in each pixel, float32 [h, w, 1]."""
+
+    picture: NDArray[Any]
+    clear: NDArray[Any]
+
+    @classmethod
+    def of(cls, gaussians: Gaussians, camera: Camera) -> _Rendering:
+        picture = render(gaussians, camera).clamp(0, 1).cpu().numpy()
+        alpha = render(gaussians, camera, "alpha").clamp(0, 1).cpu().numpy()
+        return cls(picture, 1.0 - alpha[..., None])
+
+    def correlation(self, photograph: NDArray[Any]) -> float:
+        """With a photograph, -1 to 1; 0 where the scene is not seen at all.
+
+        The rendering gets one background color, that of the photograph there: a scene may hold less than was
+        photographed, and a trainer may have put any color behind it.
+        """
+        if self.picture.shape != photograph.shape:
+            return -1.0
+        weight = max(float(self.clear.sum()), 1e-6)
+        behind = (photograph * self.clear).sum(axis=(0, 1)) / weight
+        return float((_normalized(self.picture + self.clear * behind) * _normalized(photograph)).sum())
 
 
 def find_placement(
@@ -86,6 +112,8 @@ def find_placement(
         InputError: The transform cannot be read.
     """
     matrix = None if transform is None else read_world_transform(transform)
+    if not len(gaussians):
+        return matrix  # nothing can match
     found = compare(gaussians, views if matrix is None else moved_views(views, matrix))
     beside = scene.parent / BESIDE
     if not found.matches and transform is None and beside.is_file():
@@ -129,7 +157,3 @@ def _normalized(image: NDArray[Any]) -> NDArray[Any]:
     centered = image - image.mean(axis=(0, 1))
     norm = float(np.sqrt((centered**2).sum()))
     return centered / norm if norm > 1e-3 * np.sqrt(centered.size) else np.zeros_like(centered)
-
-
-def _correlation(a: NDArray[Any], b: NDArray[Any]) -> float:
-    return float((a * b).sum()) if a.shape == b.shape else -1.0

@@ -231,6 +231,8 @@ def test_edit_refuses_bad_input(stage_files, found, edit, tmp_path, capsys):
     assert "needs --semantics" in fails(capsys, *edit, "--select", "sofa", "--remove")
     assert "color 'mud'" in fails(capsys, *edit, "--select", "all", "--recolor", "mud")
     assert "needs --views" in fails(capsys, *edit, "--select", "all", "--scale", 2, "--view", "0000")
+    seen = ["--views", stage_files.views, "--view", "nowhere"]
+    assert "has no view 'nowhere'" in fails(capsys, *edit, "--select", "all", "--scale", 2, *seen)
     itself = ["edit", stage_files.scene, "--out", stage_files.scene, "--select", "all", "--scale", 2]
     assert "is the scene itself" in fails(capsys, *itself)
     other = tmp_path / "other.json"

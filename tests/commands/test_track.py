@@ -154,7 +154,7 @@ def test_resume_needs_the_same_options(files, tracked, capsys):
 CARRIED = ("forgetting", "patience", "change", "foreground", "scoring", "temperature", "unknown_below", "photographs")
 
 
-def test_resume_compares_whatever_changes_the_answer(stopped):
+def test_resume_compares_whatever_changes_the_answer(stopped, tmp_path):
     """Of the options, and of scene, views and encoder; not of those that change only what is drawn or how fast."""
     plain = stopped().output.settings
     for name in (*CARRIED, "split"):
@@ -163,6 +163,8 @@ def test_resume_compares_whatever_changes_the_answer(stopped):
         given = [option, value] if not isinstance(value, bool) else [option if value else f"--no-{option[2:]}"]
         settings = stopped(*given).output.settings
         assert [key for key in plain if plain[key] != settings[key]] == [name]
+    np.savetxt(tmp_path / "t.txt", np.eye(4))
+    assert stopped("--transform", tmp_path / "t.txt").output.settings != plain
     asked = stopped("--classes", "1", "--text", "x", "--encoder", f"files:{plain['views']}/truth").output.settings
     assert {key for key in plain if plain[key] != asked[key]} == {"classes", "text", "encoder"}
     for option in ("--no-incremental", "--features", "--no-pictures"):
@@ -180,6 +182,33 @@ def test_every_frame_alone_differs_from_fused(files, tracked, tmp_path):
     assert main(arguments(files, tmp_path, "--forgetting", "0")) == 0
     assert (tmp_path / "00000" / "1.png").read_bytes() == (tracked / "00000" / "1.png").read_bytes()
     assert (tmp_path / "00003" / "1.png").read_bytes() != (tracked / "00003" / "1.png").read_bytes()
+
+
+def test_a_class_may_appear_in_a_later_frame(files, tmp_path, caplog):
+    """An id that no image of the first frames shows is a class that is not there yet; one in no frame is said."""
+    ids = {frame: set() for frame in range(FRAMES)}
+    for path in (files / "truth").rglob("*.png"):
+        ids[int(path.parent.name)] |= set(np.unique(read_ids(path)).tolist())
+    later = str(next(name for name in sorted(ids[3]) if name not in ids[0]))
+    parts = ["track", files / "params.npz", "--views", files, "--encoder", f"files:{files / 'truth'}", "--no-pictures"]
+    assert main([*map(str, parts), "--out", str(tmp_path), "--classes", f"1,{later},99"]) == 0
+    objects = json.loads((tmp_path / "tracks.json").read_text())["objects"]
+    assert list(objects) == ["1", later, "99"]
+    assert objects[later]["gaussians"][0] == 0 < max(objects[later]["gaussians"])
+    assert objects["1"]["visible"][0]
+    assert [record.message for record in caplog.records] == ["--classes: '99' was found in no frame; check the name"]
+
+
+def test_a_scene_that_is_empty_throughout(files, tmp_path):
+    """As Dynamic3DGaussians' arrays without rows; every mask is empty, and the pictures are drawn."""
+    with np.load(files / "params.npz") as stored:
+        arrays = {name: stored[name] for name in stored}
+    arrays = {name: a[:, :0] if a.ndim == 3 else a if name.startswith("cam") else a[:0] for name, a in arrays.items()}
+    np.savez(tmp_path / "params.npz", **arrays)
+    parts = ["track", tmp_path / "params.npz", "--views", files, "--encoder", f"files:{files / 'labels'}"]
+    assert main([*map(str, parts), "--frames", "2", "--out", str(tmp_path / "out")]) == 0
+    assert not read_ids(tmp_path / "out" / "00001" / "0.png").any()
+    assert (tmp_path / "out" / "trajectories.png").is_file()
 
 
 def test_masks_of_cameras_that_were_not_lifted(files, tmp_path):
@@ -237,6 +266,7 @@ def test_info_of_a_sequence(files, capsys):
         (["--forgetting", "1.5"], "forgetting: expected 0 to 1"),
         (["--frames", "99"], "frames: 99 are asked for"),
         (["--unknown-below", "2"], "--unknown-below"),
+        (["--temperature", "nan"], "temperature: expected a number from 1e-6 on, got nan"),
         (["--associate", "--resume"], "--associate: keeps no state"),
         (["--encoder", "files:nowhere"], "nowhere: no such folder"),
         (["--text", "open"], "texts: need features in a text space"),

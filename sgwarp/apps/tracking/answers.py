@@ -16,7 +16,7 @@ from sgwarp.encoders.calibration import Scoring
 from sgwarp.errors import InputError
 from sgwarp.querying.scores import class_votes, query
 from sgwarp.querying.segmentation import UNKNOWN, segment_votes
-from sgwarp.scene import Gaussians, View
+from sgwarp.scene import Gaussians, Semantics, View
 
 BEST_SHARE = 0.01  # of the seen Gaussians, over which the score of a query is averaged
 INNER = (0.02, 0.98)  # quantiles between which an object extends: stray Gaussians do not count
@@ -78,7 +78,7 @@ def answer(tracked: TrackedFrame, questions: Questions, views: Sequence[View]) -
         objects = object_rows(gaussians, channels, names, values, images)
         return Answer(images, channels, names, values, objects, dict.fromkeys(questions.texts, 0.0))
     semantics = tracked.semantics
-    votes = class_votes(semantics, questions.classes, questions.encoder, questions.temperature, questions.scoring)
+    votes = _votes(semantics, questions)
     best, channels = votes.max(dim=1)
     channels = torch.where((best > 0) & semantics.seen, channels, -1)
     table = torch.tensor([*values, nothing])
@@ -89,6 +89,19 @@ def answer(tracked: TrackedFrame, questions: Questions, views: Sequence[View]) -
         images[view.stem] = table[found.cpu()].numpy().astype(kind)
     objects = object_rows(gaussians, channels, names, values, images)
     return Answer(images, channels, names, values, objects, query_scores(tracked, questions))
+
+
+def _votes(semantics: Semantics, questions: Questions) -> Tensor:
+    """As `class_votes`; an id that no label image has shown so far has none, since a later frame may show it."""
+    classes = questions.classes
+    asked = (questions.encoder, questions.temperature, questions.scoring)
+    if classes is None or semantics.labels is None:
+        return class_votes(semantics, classes, *asked)
+    shown = [place for place, name in enumerate(classes) if name in semantics.labels or not name.isdecimal()]
+    votes = torch.zeros(len(semantics.seen), len(classes), device=semantics.features.device)
+    if shown:
+        votes[:, shown] = class_votes(semantics, [classes[place] for place in shown], *asked)
+    return votes
 
 
 def _names(tracked: TrackedFrame, questions: Questions) -> tuple[tuple[str, ...], tuple[int, ...]]:

@@ -138,7 +138,8 @@ def write_trajectories(path: Path, tracks: dict[str, Any]) -> bool:
         over_time.plot(times, -places[:, 1], color=color, lw=1.2)
     above.set(xlabel="x [m]", ylabel="z [m]", title="centroids from above; a dot is the last sight", aspect="equal")
     over_time.set(xlabel="frame", ylabel="-y [m]", title="height of the centroids (y down)")
-    above.legend(fontsize=7, loc="center left", bbox_to_anchor=(1.0, 0.5))
+    if above.lines:
+        above.legend(fontsize=7, loc="center left", bbox_to_anchor=(1.0, 0.5))
     with atomic_path(path) as temporary:
         figure.savefig(temporary, dpi=130)
     return True
