@@ -84,7 +84,7 @@ def read_annotation(path: Path) -> list[Query]:
                 raise InputError(f"{path}: '{entry['category']}': expected points [[x, y], ..] and a box of 4 numbers")
             polygons.setdefault(str(entry["category"]), []).append(polygon)
             boxes.setdefault(str(entry["category"]), []).append(box)
-    except (KeyError, TypeError, ValueError) as error:
+    except (KeyError, TypeError, ValueError, OverflowError) as error:
         if isinstance(error, InputError):
             raise
         raise InputError(f"{path}: is no annotation of LERF-OVS ({type(error).__name__}: {error})") from None

@@ -67,7 +67,7 @@ def read_result(path: Path, identity: Mapping[str, Any]) -> SceneResult | None:
         if not isinstance(record, dict) or record.get("identity") != json.loads(json.dumps(dict(identity))):
             return None
         return SceneResult(**_numbers(record["result"]))
-    except (InputError, KeyError, TypeError):  # of an earlier version: it is made anew
+    except (InputError, KeyError, TypeError, AttributeError):  # of an earlier version: it is made anew
         return None
 
 

@@ -18,6 +18,11 @@ from sgwarp.apps.tracking.sources import LabelFrames
 from sgwarp.apps.tracking.state import load_state, read_features, save_state
 from sgwarp.apps.tracking.tracker import Tracker
 from sgwarp.cluster.listing import list_scenes
+from sgwarp.datasets import scannet, scenesplat
+from sgwarp.datasets.base import read_class_names
+from sgwarp.datasets.lerf_ovs import read_annotation
+from sgwarp.datasets.scannet_classes import read_label_table
+from sgwarp.evaluation.results import SceneResult, read_result, write_result
 from sgwarp.files.atomic import atomic_path
 from sgwarp.io.formats.dot_splat import write_splat
 from sgwarp.io.formats.gltf import write_gltf
@@ -34,7 +39,7 @@ from sgwarp.scene import Instance, InstanceMap, View
 def more_readers(root: Path) -> list[Reader]:
     """All pairs of this file, with their files in folders below `root`."""
     made: list[Reader] = []
-    for make in (_foreign_scenes, _sog_folder, _moving, _tracking, _apps):
+    for make in (_foreign_scenes, _sog_folder, _moving, _tracking, _apps, _labeled, _scenesplat):
         made += make(root / make.__name__)
     return made
 
@@ -176,4 +181,55 @@ def _apps(root: Path) -> list[Reader]:
             Reader(f"transform {name}", folder / name, lambda name=name: read_world_transform(folder / name))
             for name in ("dataparser_transforms.json", "matrix.txt", "matrix.npy")
         ),
+    ]
+
+
+def _labeled(root: Path) -> list[Reader]:
+    import plyfile
+
+    folder = folder_of(root, "scene0000_00")
+    entry = {"category": "cup", "segmentation": [[1, 1], [9, 1], [9, 8.5]], "bbox": [1, 1, 9, 8]}
+    annotation = {"info": {"height": 12, "width": 16, "name": "frame_1.jpg"}, "objects": [entry]}
+    (folder / "frame_1.json").write_text(json.dumps(annotation))
+    (folder / "labels.tsv").write_text("id\traw_category\tnyu40id\n1\twall\t1\n2\tchair\t5\n7\tcup\t\n")
+    (folder / "pose.txt").write_text("1 0 0 0.5\n0 1 0 1\n0 0 1 2\n0 0 0 1\n")
+    (folder / "classes.json").write_text(json.dumps({"1": "couch", "2": "lamp"}))
+    rows = np.array([(0, 1, 2, 5)] * 3, dtype=[*((axis, "f4") for axis in "xyz"), ("label", "u2")])
+    mesh = folder / "scene0000_00_vh_clean_2.labels.ply"
+    plyfile.PlyData([plyfile.PlyElement.describe(rows, "vertex")]).write(str(mesh))
+    write_result(folder / "record.json", SceneResult("a", figures={"miou": 0.5}), {"version": 1})
+
+    def annotations() -> None:
+        for query in read_annotation(folder / "frame_1.json"):
+            query.mask()
+
+    return [
+        Reader("LERF-OVS annotation", folder / "frame_1.json", annotations),
+        Reader("ScanNet labels.tsv", folder / "labels.tsv", lambda: read_label_table(folder / "labels.tsv")),
+        Reader("ScanNet pose.txt", folder / "pose.txt", lambda: scannet.read_matrix(folder / "pose.txt")),
+        Reader("ScanNet mesh", mesh, lambda: scannet.read_mesh(folder)),
+        Reader("class names", folder / "classes.json", lambda: read_class_names(folder / "classes.json")),
+        Reader(
+            "evaluation record", folder / "record.json", lambda: read_result(folder / "record.json", {"version": 1})
+        ),
+    ]
+
+
+def _scenesplat(root: Path) -> list[Reader]:
+    folder = folder_of(root, "splat")
+    random = np.random.default_rng(0)
+    fields = {"coord": 3, "scale": 3, "quat": 4, "opacity": 1, "lang_feat": 6}
+    arrays = {name: random.random((5, width)).astype(np.float32) for name, width in fields.items()}
+    arrays["color"] = random.integers(0, 255, (5, 3)).astype(np.uint8)
+    arrays["valid_feat_mask"], arrays["segment"] = np.ones(5, bool), np.arange(5) - 1
+    for name, values in arrays.items():
+        np.save(folder / f"{name}.npy", values)
+
+    def read() -> None:
+        scene = scenesplat.read_gaussians(folder)
+        scenesplat.read_semantics(folder, scene)
+        scenesplat.read_points(folder)
+
+    return [
+        Reader(f"SceneSplat {name}.npy", folder / f"{name}.npy", read) for name in ("coord", "opacity", "lang_feat")
     ]

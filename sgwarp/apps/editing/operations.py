@@ -227,7 +227,8 @@ def operation_from(content: Mapping[str, Any]) -> Operation:
     Raises:
         InputError: There is no such operation, or a value does not fit.
     """
-    kind = OPERATIONS.get(content.get("do", ""))
+    name = content.get("do")
+    kind = OPERATIONS.get(name) if isinstance(name, str) else None
     if kind is None:
         raise InputError(f"do: expected one of {', '.join(OPERATIONS)}, got {content.get('do')!r}")
     given = {field.name: content[field.name] for field in fields(kind) if field.name in content}

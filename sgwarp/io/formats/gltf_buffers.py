@@ -79,7 +79,8 @@ class Document:
             InputError: It has another width, is sparse, or does not lie within its buffer.
         """
         accessor = self.row("accessors", index)
-        kind = COMPONENTS.get(accessor.get("componentType", 0))
+        code = accessor.get("componentType")
+        kind = COMPONENTS.get(code) if isinstance(code, int) else None
         if kind is None or WIDTHS.get(str(accessor.get("type"))) != width or "sparse" in accessor:
             raise InputError(f"{self.path}: attribute {name} must hold {width} numbers a row, not sparse")
         data, dtype = self.view(accessor.get("bufferView")), np.dtype(kind)
