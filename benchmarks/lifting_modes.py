@@ -263,7 +263,9 @@ def plot(results: Row, path: Path) -> None:
 
 def _mark(panel: Any, row: Row, name: str, marker: str) -> None:
     panel.plot(row["seconds"], row["mIoU"], marker, color="tab:blue" if marker == "o" else "tab:green")
-    panel.annotate(name, (row["seconds"], row["mIoU"]), textcoords="offset points", xytext=(5, 3), fontsize=8)
+    below = name in ("center", "strongest", "reliable")  # points lie close to each other
+    place = (5, -11) if below else (5, 4)
+    panel.annotate(name, (row["seconds"], row["mIoU"]), textcoords="offset points", xytext=place, fontsize=8)
 
 
 def main() -> None:
