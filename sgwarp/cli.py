@@ -13,6 +13,8 @@ import shlex
 import sys
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager, suppress
+from pathlib import Path
+from typing import Any
 
 from sgwarp.errors import InputError, printable
 from sgwarp.runs.interrupt import termination_as_interrupt, was_terminated
@@ -70,8 +72,20 @@ def _run(argv: list[str]) -> int:
     command = tyro.extras.subcommand_cli_from_dict(dict(COMMANDS), prog="sgwarp", description=description, args=argv)
     command.command_line = shlex.join(["sgwarp", *argv])
     with _notices():
-        code = command.run()
+        try:
+            code = command.run()
+        except InputError as error:
+            raise InputError(_as_option(str(error), vars(command))) from error
     return code or 0
+
+
+def _as_option(message: str, given: dict[str, Any]) -> str:
+    """The message with the argument that it begins with as the option that was given; names of files stay."""
+    name = message.partition(":")[0]
+    paths = [str(value) for value in given.values() if isinstance(value, Path)]
+    if name not in given or isinstance(given[name], Path) or name in paths:
+        return message
+    return f"--{name.replace('_', '-')}{message[len(name) :]}"
 
 
 def _fail(message: str, code: int) -> int:

@@ -504,3 +504,24 @@ def test_leakage_and_completeness_count_pixels():
     assert (found.leakage, found.completeness) == (pytest.approx(1 / 5), pytest.approx(4 / 5))
     with pytest.raises(InputError, match="the mask is empty"):
         measure_edit(before, after, torch.zeros_like(mask))
+
+
+# Numbers that float32 cannot hold
+
+
+@pytest.mark.parametrize(
+    "operation", [ops.Scale(1e300), ops.Scale(1e-60), ops.Move((1e300, 0, 0)), ops.Duplicate((0, 1e39, 0))]
+)
+def test_what_no_file_can_hold_is_refused(stage, operation):
+    session = EditSession(stage.gaussians)
+    with pytest.raises(InputError, match=f"^{operation.name}: takes [0-9]+ Gaussians out of the range of 32-bit"):
+        session.apply(EditStep(ALL, operation))
+    assert session.state.gaussians is stage.gaussians
+
+
+@pytest.mark.parametrize("size", [1e-300, 1e300])
+def test_an_axis_of_any_length(size):
+    quat = ops.axis_quaternion((0.0, 0.0, size), math.pi / 2)
+    half = math.sqrt(0.5)
+    assert quat.tolist() == pytest.approx([half, 0, 0, half])
+    ops.Rotate((0, size, 0), 20)

@@ -231,6 +231,7 @@ def test_edit_refuses_bad_input(stage_files, found, edit, tmp_path, capsys):
     assert "needs --semantics" in fails(capsys, *edit, "--select", "sofa", "--remove")
     assert "color 'mud'" in fails(capsys, *edit, "--select", "all", "--recolor", "mud")
     assert "needs --views" in fails(capsys, *edit, "--select", "all", "--scale", 2, "--view", "0000")
+    assert "out of the range" in fails(capsys, *edit, "--select", "all", "--move", 1e39, 0, 0)
     seen = ["--views", stage_files.views, "--view", "nowhere"]
     assert "has no view 'nowhere'" in fails(capsys, *edit, "--select", "all", "--scale", 2, *seen)
     itself = ["edit", stage_files.scene, "--out", stage_files.scene, "--select", "all", "--scale", 2]
@@ -291,6 +292,23 @@ def test_instance_options_change_what_they_name_alone(stage, stage_files, stoppe
     wanted = tuple(value.split(", ")) if name == "levels" else value
     assert getattr(positional[3], field) != wanted
     assert replace(positional[3], **{field: wanted}) == changed[3]
+
+
+@pytest.mark.parametrize(
+    ("option", "value"), [("--least-iou", "nan"), ("--neighbors", -1), ("--least-gaussians", 0), ("--levels", "s,s")]
+)
+def test_a_message_names_the_option(stage_files, capsys, tmp_path, option, value):
+    parts = ["instances", stage_files.scene, "--views", stage_files.views, "--masks", f"files:{stage_files.labels}"]
+    line = fails(capsys, *parts, "--out", tmp_path / "i.safetensors", option, value)
+    assert line.startswith(f"sgwarp: {option}: expected ")
+
+
+def test_a_file_named_like_an_option_keeps_its_name(stage_files, capsys, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    line = fails(
+        capsys, "instances", stage_files.scene, "--views", "masks", "--masks", "graph", "--out", "i.safetensors"
+    )
+    assert line.startswith("sgwarp: masks: ")
 
 
 def test_edit_options_become_steps(stage, stage_files, found, stopped, edit):

@@ -133,7 +133,7 @@ class Rotate:
     def __post_init__(self) -> None:
         object.__setattr__(self, "axis", _vector("rotate", "axis", self.axis))
         _number("rotate", "degrees", self.degrees)
-        if math.hypot(*self.axis) == 0:
+        if not any(self.axis):
             raise InputError("rotate: the axis has no direction")
 
     def apply(self, gaussians: Gaussians, chosen: Tensor) -> Change:
@@ -264,6 +264,7 @@ def parse_color(text: str) -> Vector:
 def axis_quaternion(axis: Vector, angle: float) -> Tensor:
     """(w, x, y, z) of a turn by `angle` [rad], counterclockwise seen against the axis, float64 [4]."""
     direction = torch.tensor(axis, dtype=torch.float64)
+    direction = direction / direction.abs().max()  # its square may overflow
     direction = direction / direction.norm()
     return torch.cat([torch.tensor([math.cos(angle / 2)], dtype=torch.float64), math.sin(angle / 2) * direction])
 

@@ -7,6 +7,7 @@ from collections.abc import Sequence
 import torch
 from torch import Tensor
 
+from sgwarp.apps.editing.operations import Change
 from sgwarp.apps.editing.picker import EditContext, EditState, pick
 from sgwarp.apps.editing.script import EditStep
 from sgwarp.apps.editing.selection import Selection
@@ -125,6 +126,7 @@ class EditSession:
     def _next(self, state: EditState, step: EditStep) -> EditState:
         chosen = pick(state, step.selection, self.context)
         change = step.operation.apply(state.gaussians, chosen)
+        _require_representable(state.gaussians, change, step.operation.name)
         if change.rows is None:
             return EditState(change.gaussians, state.rows, state.copies, chosen)
         copies, selected = state.copies[change.rows], chosen[change.rows]
@@ -132,6 +134,18 @@ class EditSession:
             copies[-change.added :] = int(state.copies.max()) + 1
             selected = torch.arange(len(copies), device=copies.device) >= len(copies) - change.added
         return EditState(change.gaussians, state.rows[change.rows], copies, selected)
+
+
+def _require_representable(before: Gaussians, change: Change, name: str) -> None:
+    """Raise InputError if a Gaussian left the range of float32: nothing would draw it any more."""
+
+    def usable(gaussians: Gaussians) -> Tensor:
+        return gaussians.finite & (gaussians.scales > 0).all(dim=1)
+
+    was = usable(before)
+    lost = int(((was if change.rows is None else was[change.rows]) & ~usable(change.gaussians)).sum())
+    if lost:
+        raise InputError(f"{name}: takes {lost} Gaussians out of the range of 32-bit numbers; give a value closer to 1")
 
 
 def edit(gaussians: Gaussians, steps: Sequence[EditStep], context: EditContext | None = None) -> EditState:

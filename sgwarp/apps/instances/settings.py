@@ -62,7 +62,6 @@ class InstanceSettings:
             raise InputError(f"least_cosine: expected a cosine from -1 to 1, got {self.least_cosine}")
         if not 0.0 < self.pixel_weight < float("inf"):
             raise InputError(f"pixel_weight: expected a positive number of pixels, got {self.pixel_weight}")
-        if self.samples_per_mask < 0 or self.least_gaussians < 1 or self.neighbors < 0 or self.candidates < 1:
-            raise InputError(
-                "samples_per_mask and neighbors must be 0 or more, least_gaussians and candidates 1 or more"
-            )
+        for name, least in (("samples_per_mask", 0), ("neighbors", 0), ("least_gaussians", 1), ("candidates", 1)):
+            if getattr(self, name) < least:
+                raise InputError(f"{name}: expected {least} or more, got {getattr(self, name)}")
