@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from functools import cache
 from pathlib import Path
 from typing import Any
+
+from sgwarp.files.documents import read_json
 
 FILE = Path(__file__).with_name("published.json")
 
@@ -39,7 +40,7 @@ class Published:
 
 @cache
 def _content() -> dict[str, Any]:
-    content: dict[str, Any] = json.loads(FILE.read_text(encoding="utf-8"))
+    content: dict[str, Any] = read_json(FILE)
     return content
 
 

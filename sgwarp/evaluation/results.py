@@ -64,11 +64,16 @@ def read_result(path: Path, identity: Mapping[str, Any]) -> SceneResult | None:
         return None
     try:
         record = read_json(path)
-        if not isinstance(record, dict) or record.get("identity") != json.loads(json.dumps(dict(identity))):
+        if not isinstance(record, dict) or _text(record.get("identity")) != _text(dict(identity)):
             return None
         return SceneResult(**_numbers(record["result"]))
     except (InputError, KeyError, TypeError, AttributeError):  # of an earlier version: it is made anew
         return None
+
+
+def _text(identity: Any) -> str:
+    """As JSON, which has no tuples."""
+    return json.dumps(identity, sort_keys=True)
 
 
 def finite(value: Any) -> Any:

@@ -341,7 +341,7 @@ def test_bad_input(stage, shuffled):
         ({"least_iou": 1.0}, "least_iou"),
         ({"least_cosine": 2.0}, "least_cosine"),
         ({"pixel_weight": 0.0}, "pixel_weight"),
-        ({"candidates": 0}, "candidates 1 or more"),
+        ({"candidates": 0}, "candidates: expected 1 or more"),
     ],
 )
 def test_settings_are_checked(options, message):

@@ -124,7 +124,7 @@ def test_a_fit_starts_from_nothing(boards, tmp_path):
         (["--init", "depth"], "--init depth: needs --depth"),
         (["--points", "missing.ply"], "missing.ply: no such file or folder; check the path"),
         (["--resume"], "scene.ply.checkpoint: no such file"),
-        (["--checkpoint-every", "0"], "checkpoint_every: expected at least 1"),
+        (["--checkpoint-every", "0"], "--checkpoint-every: expected at least 1"),
         (["--masks", "."], "holds no mask of any view"),
         (["--cap", "2"], "cap: a scene starts from at least 4 points"),
     ],
