@@ -30,7 +30,6 @@ LEAST_DISTANCE = 1e-4  # [extent of the cameras], for points in the same place
 VISIBLE = 1 / 255  # opacity from which on a Gaussian changes a pixel
 LEAST_POINTS = 4  # that three neighbours need
 RANDOM_COUNT = 50_000
-SHARE_OF_CAP = 2  # so much of the cap is left to the fit: the half
 LEAST_CERTAIN = 500  # depths that are worth starting from
 NEAREST, FARTHEST = 0.2, 4.0  # of points anywhere [extent of the cameras]
 
@@ -115,7 +114,7 @@ def random_points(
         Positions, float64 [N, 3], colors in [0, 1], float32 [N, 3], and the size of Gaussians there, in root mean
         square distances to the three nearest others.
     """
-    count = min(settings.cap // SHARE_OF_CAP, RANDOM_COUNT)
+    count = _most_points(settings)
     random = generator(settings.seed, 0, "random points")
     places, colors = _points_where_photographs_agree(photographs, count, random, progress)
     if len(places) >= LEAST_CERTAIN:
@@ -124,12 +123,17 @@ def random_points(
     return *_points_anywhere(photographs, count, random), RANDOM_SIZE
 
 
+def _most_points(settings: FitSettings) -> int:
+    """How many points to start from: "default" has to find room for what it adds, "mcmc" moves what is there."""
+    return min(settings.cap if settings.strategy == "mcmc" else settings.cap // 2, RANDOM_COUNT)
+
+
 def completed(
     positions: Tensor, colors: Any, photographs: Sequence[Photograph], settings: FitSettings, progress: Report
 ) -> tuple[Tensor, Tensor]:
-    """Few points, such as features leave them, and more of those where photographs agree, up to half the cap."""
+    """Few points, such as features leave them, and more of those where photographs agree."""
     random = generator(settings.seed, 0, "more points")
-    count = min(settings.cap // SHARE_OF_CAP, RANDOM_COUNT) - len(positions)
+    count = _most_points(settings) - len(positions)
     more, their_colors = _points_where_photographs_agree(photographs, count, random, progress)
     logger.info("start: %d points are few; %d are added where photographs agree", len(positions), len(more))
     own = torch.as_tensor(colors).to(torch.float32)
