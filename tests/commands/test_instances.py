@@ -247,25 +247,6 @@ def test_edit_refuses_bad_input(stage_files, found, edit, tmp_path, capsys):
 # Every option reaches what does the work
 
 
-@pytest.fixture
-def stopped(monkeypatch, capsys):
-    """`stopped(target, *arguments)` runs a command up to the call of `target`; its arguments and keywords."""
-
-    def called(target: str, *arguments):
-        seen = []
-
-        def stop(*positional, **keywords):
-            seen.append((positional, keywords))
-            raise InputError("stopped here")
-
-        with monkeypatch.context() as patch:
-            patch.setattr(target, stop)
-            assert "stopped here" in fails(capsys, *arguments)
-        return seen[0]
-
-    return called
-
-
 INSTANCE_OPTIONS = {
     "group": ("name", "grouping"),
     "levels": ("s, l", "levels"),
@@ -284,14 +265,12 @@ def test_instance_options_change_what_they_name_alone(stage, stage_files, stoppe
     parts += ["--out", tmp_path / "i.safetensors", "--semantics", tmp_path / "s.safetensors"]
     value, field = INSTANCE_OPTIONS[name]
     target = "sgwarp.apps.instances.finder.find"
-    (positional, keywords), (changed, _) = (
-        stopped(target, *parts, *more) for more in ([], [f"--{name.replace('_', '-')}", value])
-    )
-    assert [view.stem for view in positional[1]] == [view.stem for view in stage.views]
-    assert keywords["semantics"].space == "toy"
+    plain, changed = (stopped(target, *parts, *more) for more in ([], [f"--{name.replace('_', '-')}", value]))
+    assert [view.stem for view in plain.positional[1]] == [view.stem for view in stage.views]
+    assert plain.semantics.space == "toy"
     wanted = tuple(value.split(", ")) if name == "levels" else value
-    assert getattr(positional[3], field) != wanted
-    assert replace(positional[3], **{field: wanted}) == changed[3]
+    assert getattr(plain.positional[3], field) != wanted
+    assert replace(plain.positional[3], **{field: wanted}) == changed.positional[3]
 
 
 @pytest.mark.parametrize(
@@ -314,14 +293,15 @@ def test_a_file_named_like_an_option_keeps_its_name(stage_files, capsys, tmp_pat
 def test_edit_options_become_steps(stage, stage_files, found, stopped, edit):
     """A selection with all it was given, and operations in the order in which they make sense."""
     target = "sgwarp.apps.editing.session.edit"
-    (_, (plain,), context), _ = stopped(target, *edit, "--select", "id:1", "--remove")
+    _, (plain,), context = stopped(target, *edit, "--select", "id:1", "--remove").positional
     assert plain == EditStep(Selection(("id:1",)), ops.Remove())
     assert len(context.instances.table) == 4
     assert (context.semantics, context.views) == (None, ())
     more = ["--keep", "id:2", "box:0,0,0,1,1,1", "--negatives", "wall", "--threshold", 0.25, "--grow", -0.5]
     given = ["--move", 1, 2, 3, "--recolor", "#ff0000", "--rotate", 0, 1, 0, 30, "--scale", 2, "--isolate", 0.25]
     given += ["--duplicate", 4, 5, 6, "--extract", "--views", stage_files.views]
-    (_, steps, context), _ = stopped(target, *edit, "--select", "id:1", "lamp", *more, "--no-clean", *given)
+    call = stopped(target, *edit, "--select", "id:1", "lamp", *more, "--no-clean", *given)
+    _, steps, context = call.positional
     first = Selection(("id:1", "lamp"), ("id:2", "box:0,0,0,1,1,1"), ("wall",), 0.25, -0.5, clean=False)
     assert [step.selection for step in steps] == [first, *[Selection(("last",), clean=False)] * 6]
     assert [step.operation for step in steps] == [
@@ -342,8 +322,8 @@ def test_edit_asks_the_encoder_of_its_semantics(stage, stage_files, stopped, toy
     path = tmp_path / "s.safetensors"
     save_semantics(lift(stage_files.gaussians, stage.views, stage.dense), path, {"encoder": "clip:somewhere"})
     for more in ([], ["--encoder", "other"]):
-        (_, _, context), _ = stopped(
+        _, _, context = stopped(
             *("sgwarp.apps.editing.session.edit", *edit, "--select", "lamp", "--remove", "--semantics", path, *more)
-        )
+        ).positional
         assert context.encoder is toy_text
     assert asked == [("toy", "clip:somewhere", "cpu"), ("toy", "other", "cpu")]

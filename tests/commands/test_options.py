@@ -14,7 +14,6 @@ import torch
 
 from sgwarp.cli import main
 from sgwarp.commands import COMMANDS
-from sgwarp.errors import InputError
 from sgwarp.files.images import read_ids, read_rgb, write_ids
 from sgwarp.io.points import load_points
 from sgwarp.io.store import load_semantics, read_notes, save_semantics
@@ -30,27 +29,6 @@ NAMES = ["wall", "left door", "lamp", "book"]
 
 def run(*arguments) -> int:
     return main([str(argument) for argument in arguments])
-
-
-@pytest.fixture
-def stopped(monkeypatch, capsys):
-    """`stopped(target, *arguments)` runs a command up to the call of `target`; its arguments, and its keywords."""
-
-    def called(target: str, *arguments):
-        seen = []
-
-        def stop(*positional, **keywords):
-            seen.append((positional, keywords))
-            raise InputError("stopped here")
-
-        with monkeypatch.context() as patch:
-            patch.setattr(target, stop)
-            assert run(*arguments) == 2
-        assert capsys.readouterr().err.strip().splitlines()[-1] == "sgwarp: stopped here"
-        (call,) = seen
-        return SimpleNamespace(positional=call[0], **call[1])
-
-    return called
 
 
 @pytest.fixture

@@ -12,7 +12,6 @@ from sgwarp.errors import InputError
 from sgwarp.io.scenes import load_gaussians, save_gaussians
 from sgwarp.io.store import save_semantics
 from sgwarp.network.augmentation import Augmentation
-from sgwarp.network.layers.mink_unet import ARCHITECTURES, Architecture
 from sgwarp.network.prediction import predict
 from sgwarp.network.training.contrastive import MaskedView, MaskRows, contrastive_loss, mask_rows
 from sgwarp.network.training.data import TrainingScene
@@ -21,18 +20,7 @@ from sgwarp.network.training.trainer import distill
 from sgwarp.ops.splatting.forward import rasterize
 from sgwarp.scene import FeatureMap, Semantics
 
-pytestmark = pytest.mark.slow
-
-
-@pytest.fixture(scope="module", autouse=True)
-def small_and_alone():
-    """A U-Net of few channels, on one thread."""
-    threads = torch.get_num_threads()
-    torch.set_num_threads(1)
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setitem(ARCHITECTURES, "tiny", Architecture((1,) * 8, (16,) * 8))
-        yield
-    torch.set_num_threads(threads)
+pytestmark = [pytest.mark.slow, pytest.mark.usefixtures("tiny_architecture")]
 
 
 def test_rows_are_means_of_the_rendering_over_the_masks(stage):

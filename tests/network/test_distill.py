@@ -17,7 +17,7 @@ from sgwarp.io.scenes import load_gaussians, save_gaussians
 from sgwarp.io.store import save_semantics
 from sgwarp.network.augmentation import Augmentation
 from sgwarp.network.inputs import voxelize
-from sgwarp.network.layers.mink_unet import ARCHITECTURES, Architecture, MinkUNet
+from sgwarp.network.layers.mink_unet import MinkUNet
 from sgwarp.network.prediction import predict
 from sgwarp.network.semantic_network import load_network
 from sgwarp.network.training import trainer
@@ -27,20 +27,9 @@ from sgwarp.network.training.trainer import distill, state_path
 from sgwarp.runs.log import RunLog
 from sgwarp.scene import Gaussians, Semantics
 
-pytestmark = pytest.mark.slow
+pytestmark = [pytest.mark.slow, pytest.mark.usefixtures("tiny_architecture")]
 
 SETTINGS = DistillSettings(arch="tiny", voxel=0.12, epochs=2, augment=Augmentation(up=1, elastic=()))
-
-
-@pytest.fixture(scope="module", autouse=True)
-def small_and_alone():
-    """A U-Net of few channels, on one thread: waiting for others costs more than its small products."""
-    threads = torch.get_num_threads()
-    torch.set_num_threads(1)
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setitem(ARCHITECTURES, "tiny", Architecture((1,) * 8, (16,) * 8))
-        yield
-    torch.set_num_threads(threads)
 
 
 def lifted(gaussians: Gaussians, classes: torch.Tensor, seen: torch.Tensor | None = None) -> Semantics:

@@ -6,7 +6,6 @@ import pytest
 import torch
 
 from sgwarp.network.augmentation import Augmentation
-from sgwarp.network.layers.mink_unet import ARCHITECTURES, Architecture
 from sgwarp.network.prediction import predict
 from sgwarp.network.training import trainer
 from sgwarp.network.training.data import TrainingScene, reliability
@@ -14,17 +13,8 @@ from sgwarp.network.training.settings import DistillSettings
 from sgwarp.network.training.trainer import distill
 from sgwarp.scene import Semantics
 
-pytestmark = pytest.mark.slow
+pytestmark = [pytest.mark.slow, pytest.mark.usefixtures("tiny_architecture")]
 TURNED = Augmentation(up=1, elastic=())
-
-
-@pytest.fixture(autouse=True)
-def small(monkeypatch):
-    monkeypatch.setitem(ARCHITECTURES, "tiny", Architecture((1,) * 8, (8,) * 8))
-    before = torch.get_num_threads()
-    torch.set_num_threads(1)
-    yield
-    torch.set_num_threads(before)
 
 
 @pytest.fixture

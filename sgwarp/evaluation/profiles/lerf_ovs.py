@@ -83,12 +83,8 @@ def score_maps(case: Case, result: SceneResult, sheets: Path) -> None:
                 located.append(float(hits_any_box(place.pixels, boxes)))
                 ious.append(mask_iou(mask, truth))
             result.per_class[f"{query.text} ({view.stem})"] = {"located": located[-1], "iou": ious[-1]}
-            if len(result.sheets) < case.settings.sheets:
-                with case.log.stage("draw"):
-                    name = f"{view.stem}_{len(result.sheets)}.png"
-                    pixel = (int(place.pixels[0, 0]), int(place.pixels[0, 1]))
-                    draw_query(sheets / name, image_at(case, view), truth, maps[level, index], mask, pixel)
-                    result.sheets.append(name)
+            pixel = (int(place.pixels[0, 0]), int(place.pixels[0, 1]))
+            add_sheet(case, result, sheets, view, truth, maps[level, index], mask, pixel)
     put_queries(result, located=located, iou=ious)
 
 
@@ -117,11 +113,9 @@ def score_selection(case: Case, result: SceneResult, sheets: Path) -> None:
             }
             if len(result.sheets) < case.settings.sheets:
                 with case.log.stage("draw"):
-                    name = f"{view.stem}_{len(result.sheets)}.png"
                     column = best[:, texts.index(query.text)].clamp(0, 1)[:, None]
                     shown = render(case.gaussians, view.camera, "features", column)[..., 0].cpu()
-                    draw_query(sheets / name, image_at(case, view), query.mask(), shown, mask, None)
-                    result.sheets.append(name)
+                add_sheet(case, result, sheets, view, query.mask(), shown, mask)
     put_queries(result, iou=ious)
 
 
@@ -131,6 +125,24 @@ def selection_mask(case: Case, view: View, chosen: Tensor) -> Tensor:
         return torch.zeros(view.camera.size, dtype=torch.bool)
     picture = render(case.gaussians.subset(chosen), view.camera).cpu().clamp(0, 1)
     return (picture * torch.tensor(GRAY)).sum(dim=2) > GRAY_ABOVE
+
+
+def add_sheet(
+    case: Case,
+    result: SceneResult,
+    sheets: Path,
+    view: View,
+    truth: Tensor,
+    scores: Tensor,
+    mask: Tensor,
+    pixel: tuple[int, int] | None = None,
+) -> None:
+    """Draw a query beside its truth, unless the scene has as many sheets as were asked for."""
+    if len(result.sheets) < case.settings.sheets:
+        with case.log.stage("draw"):
+            name = f"{view.stem}_{len(result.sheets)}.png"
+            draw_query(sheets / name, image_at(case, view), truth, scores, mask, pixel)
+            result.sheets.append(name)
 
 
 def put_queries(result: SceneResult, **values: list[float]) -> None:

@@ -14,9 +14,8 @@ from sgwarp.errors import InputError
 from sgwarp.evaluation.answers import Answers
 from sgwarp.evaluation.cases import Case, split_by_label
 from sgwarp.evaluation.profiles.base import Profile, total_means, total_of_values
-from sgwarp.evaluation.profiles.lerf_ovs import all_texts, image_at, put_queries, queries_by_view
+from sgwarp.evaluation.profiles.lerf_ovs import add_sheet, all_texts, put_queries, queries_by_view
 from sgwarp.evaluation.results import SceneResult
-from sgwarp.evaluation.sheets import draw_query
 from sgwarp.lifting.lifter import lift
 from sgwarp.metrics.overlap import boundary_iou, macro, mask_iou, mean
 from sgwarp.querying.scoring import score_texts
@@ -40,7 +39,7 @@ def score_phrases(case: Case, result: SceneResult, sheets: Path) -> None:
             mask, truth = scores > above, query.mask()
             ious[query.text].append(mask_iou(mask, truth))
             boundaries[query.text].append(boundary_iou(mask, truth))
-            _draw(case, result, sheets, view, truth, scores, mask)
+            add_sheet(case, result, sheets, view, truth, scores, mask)
     result.values |= {"iou": [mean(each) for each in ious.values()]}
     result.figures |= {"iou": macro(ious), "boundary_iou": macro(boundaries)}
     result.per_class = {name: {"iou": mean(ious[name]), "boundary_iou": mean(boundaries[name])} for name in ious}
@@ -75,7 +74,7 @@ def score_strokes(case: Case, result: SceneResult, sheets: Path) -> None:
             mask, truth = shown > 0, query.mask()
             ious.append(mask_iou(mask, truth))
             accuracies.append(float((mask == truth).float().mean()))
-            _draw(case, result, sheets, view, truth, shown, mask)
+            add_sheet(case, result, sheets, view, truth, shown, mask)
     if not ious:
         raise InputError(f"{case.scene.folder}: scene {case.scene.name} has no view to score but the one drawn on")
     put_queries(result, iou=ious, accuracy=accuracies)
@@ -102,16 +101,6 @@ def stroke_scores(case: Case, strokes: Scribbles) -> Tensor:
     prototypes = torch.nn.functional.normalize(weights.T @ features, dim=1)  # [2, C]
     cosines = features @ prototypes.T
     return cosines[:, 0] - cosines[:, 1]
-
-
-def _draw(
-    case: Case, result: SceneResult, sheets: Path, view: View, truth: Tensor, scores: Tensor, mask: Tensor
-) -> None:
-    if len(result.sheets) < case.settings.sheets:
-        with case.log.stage("draw"):
-            name = f"{view.stem}_{len(result.sheets)}.png"
-            draw_query(sheets / name, image_at(case, view), truth, scores, mask, None)
-            result.sheets.append(name)
 
 
 LERF_MASK = Profile(
