@@ -71,7 +71,9 @@ class Drawn:
 def draw(shot: Shot, camera: Camera) -> Drawn:
     """The picture of a shot as seen from a camera."""
     gaussians = shot.gaussians
-    background = torch.tensor(shot.background, dtype=torch.float32, device=gaussians.device)
+    background = None
+    if any(shot.background):
+        background = torch.tensor(shot.background, dtype=torch.float32, device=gaussians.device)
     seen = rasterize(gaussians, camera, background=background, depth=shot.depth or shot.mode == "depth")
     depth = None if seen.depth is None else seen.depth.cpu().numpy()
     if shot.mode == "depth":

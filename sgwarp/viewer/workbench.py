@@ -91,6 +91,7 @@ class Workbench:
         self._listeners: list[Callable[[], None]] = []
         self._frames: OrderedDict[int, Gaussians] = OrderedDict()
         self._revision = 0
+        self._range: tuple[Materials, tuple[float, float]] | None = None
         self._begin(given)
 
     def _begin(self, given: Materials) -> None:
@@ -223,9 +224,16 @@ class Workbench:
 
     def depth_range(self) -> tuple[float, float]:
         """Near and far plane for cameras that move freely in the scene [world units]."""
-        near = near_plane(self.materials.views) if self.materials.views else None
-        if near is None:
-            means = self.materials.gaussians.means[self.materials.gaussians.finite]
-            spread = (means - means.median(dim=0).values).norm(dim=1).median() if len(means) else torch.ones(())
-            near = max(float(spread) / LEAST_STEPS, 1e-6)
-        return near, near * 1e8
+        given = self.materials
+        if self._range is None or self._range[0] is not given:  # asked for with every move of a camera
+            self._range = given, _depth_range(given)
+        return self._range[1]
+
+
+def _depth_range(given: Materials) -> tuple[float, float]:
+    near = near_plane(given.views) if given.views else None
+    if near is None:
+        means = given.gaussians.means[given.gaussians.finite]
+        spread = (means - means.median(dim=0).values).norm(dim=1).median() if len(means) else torch.ones(())
+        near = max(float(spread) / LEAST_STEPS, 1e-6)
+    return near, near * 1e8
