@@ -31,20 +31,26 @@ SECONDS_PER_KEY = 1.5  # between two places of a camera path
 Progress = Callable[[int, int], None]
 
 
-def scene_file(bench: Workbench, plain: bool, only: Tensor | None = None) -> bytes:
-    """The scene as edited, as PLY.
+def scene_file(bench: Workbench, plain: bool, only: Tensor | None = None, moment: int = 0) -> bytes:
+    """The scene as edited, or a frame of a moving one, as PLY.
 
     Args:
         bench: Of the scene.
         plain: Leave out the columns that the loaded file has besides those of the reference implementation.
         only: Gaussians to save, bool [N]; all if None.
+        moment: Frame of a moving scene.
+
+    Raises:
+        InputError: The scene has changed since `only` was chosen.
     """
-    state = bench.state
+    scene = bench.scene(moment)
+    if only is not None and len(only) != len(scene.gaussians):
+        raise InputError("the selection is of an earlier state of the scene; select again")
     extras = None if plain else bench.session.original.extras
     if extras is not None:
-        rows = state.rows.cpu().numpy()
+        rows = scene.rows.cpu().numpy()
         extras = {name: column[rows] for name, column in extras.items()}
-    gaussians = replace(state.gaussians.to("cpu"), extras=extras)
+    gaussians = replace(scene.gaussians.to("cpu"), extras=extras)
     if only is not None:
         gaussians = gaussians.subset(only.cpu())
     return _written("scene.ply", lambda path: save_gaussians(gaussians, path))

@@ -91,6 +91,12 @@ class Answers:
         known = self.scores.known.tolist()
         return tuple(text for text, means in zip(self.questions.queries, known, strict=True) if not means)
 
+    @property
+    def first(self) -> int | None:
+        """The first query that means something to the encoder, which histogram and list are about; None if none does."""
+        known = self.scores.known.nonzero().flatten().tolist()
+        return known[0] if known else None
+
     def histogram(self, query: int = 0) -> tuple[Tensor, Tensor]:
         """How many seen Gaussians score how much: centers of the bins, float64 [40], and counts, float64 [40]."""
         known = self.scores.values[self.scores.seen, query].double().cpu().clamp(LOW, HIGH)
@@ -157,7 +163,9 @@ class Asker:
             ensemble=questions.ensemble,
             **options,  # type: ignore[arg-type]
         )
-        return Answers(questions, scores)
+        # The values of a phrase without meaning are noise that `rescale` has blown up.
+        values = torch.where(scores.known.to(scores.values.device), scores.values, 0.0)
+        return Answers(questions, replace(scores, values=values))
 
     def _encoder(self, templates: str) -> TextEncoder | None:
         if self.encoder is None or templates == OWN or self.with_templates is None:

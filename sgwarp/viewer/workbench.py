@@ -150,14 +150,25 @@ class Workbench:
         with self._lock:
             return self.session.state
 
+    def require_still(self, operation: Operation) -> None:
+        """Refuse to edit a scene that moves.
+
+        Raises:
+            InputError: It does.
+        """
+        if self.frames > 1:
+            raise InputError(
+                f"{operation.name}: a moving scene can be looked at and asked, not edited; open one frame of it (save the "
+                "one that is shown as Scene (PLY))"
+            )
+
     def apply(self, term: str, operation: Operation) -> str:
         """Edit what a term selects; says what was done.
 
         Raises:
             InputError: The scene moves, or as `EditSession.apply`; nothing has changed then.
         """
-        if self.frames > 1:
-            raise InputError(f"{operation.name}: a moving scene cannot be edited; open one of its frames")
+        self.require_still(operation)
         with self._lock:
             before = len(self.session.state.gaussians)
             after = self.session.apply(EditStep(Selection((term,), clean=False), operation))
@@ -221,6 +232,15 @@ class Workbench:
             self.session.context = replace(self.session.context, semantics=semantics)
             self.asker = replace(self.asker, semantics=semantics)
             self._changed()
+
+    def extent(self) -> tuple[tuple[float, float, float], tuple[float, float, float]]:
+        """Two corners of a box that holds all centers but the outermost hundredth on each side [scene units]."""
+        means = self.materials.gaussians.means[self.materials.gaussians.finite].double().cpu()
+        if not len(means):
+            return (0.0, 0.0, 0.0), (0.0, 0.0, 0.0)
+        ordered, last = means.sort(dim=0).values, len(means) - 1
+        low, high = ordered[last // 100].tolist(), ordered[last - last // 100].tolist()
+        return (low[0], low[1], low[2]), (high[0], high[1], high[2])
 
     def depth_range(self) -> tuple[float, float]:
         """Near and far plane for cameras that move freely in the scene [world units]."""
