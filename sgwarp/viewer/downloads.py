@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -168,8 +169,7 @@ def decode_picture(data: bytes) -> Picture:
     size = image_size(data)
     if size is not None and size[0] * size[1] > MOST_UPLOADED:
         raise InputError(f"picture: is {size[1]} x {size[0]}, more than {MOST_UPLOADED} pixels; make it smaller")
-    with TemporaryDirectory() as folder:
-        path = Path(folder) / "picture"
+    with _scratch("picture") as path:
         path.write_bytes(data)
         try:
             return read_rgb(path)
@@ -178,7 +178,21 @@ def decode_picture(data: bytes) -> Picture:
 
 
 def _written(name: str, write: Callable[[Path], None]) -> bytes:
-    with TemporaryDirectory() as folder:
-        path = Path(folder) / name
+    with _scratch(name) as path:
         write(path)
         return path.read_bytes()
+
+
+@contextmanager
+def _scratch(name: str) -> Iterator[Path]:
+    """A place for a temporary file.
+
+    Raises:
+        InputError: There is no room for it.
+    """
+    try:
+        with TemporaryDirectory() as folder:
+            yield Path(folder) / name
+    except OSError as error:
+        reason = error.strerror or str(error)
+        raise InputError(f"{name}: no temporary file can be written ({reason}); free some room or set TMPDIR") from None

@@ -37,7 +37,8 @@ def legend(mode: Mode, answers: Answers | None, instances: InstanceMap | None = 
         return _objects(instances, level or instances.levels[-1])
     if answers is None or mode not in ("relevancy", "segmentation"):
         return []
-    names = answers.questions.queries
+    unknown = answers.unknown
+    names = [f"{name} (unknown to the encoder)" if name in unknown else name for name in answers.questions.queries]
     if mode == "segmentation":
         return [*_named(names, answers.questions.colors), ("none of these", "#555555")]
     if len(names) > 1:

@@ -166,6 +166,7 @@ class Panel:
             scales={"x": {"time": False, "range": (LOW, HIGH)}},
             axes=({"stroke": "#adb5bd"}, {"show": False}),  # logarithms; only their shape says something
             legend={"show": False},
+            padding=(8, 16, 0, 16),
             height=110,
             visible=False,
         )
@@ -403,7 +404,8 @@ def _shift(values: Any) -> ops.Vector:
 
 def _legend(rows: list[tuple[str, str]]) -> str:
     lines = [
-        f'<div><span style="display:inline-block;width:0.9em;height:0.9em;background:{color};margin-right:0.5em">'
+        f'<div><span style="display:inline-block;width:0.9em;height:0.9em;background:{color};'
+        f'border:1px solid #868e96;margin-right:0.5em">'
         f"</span>{html.escape(name)}</div>"
         for name, color in rows[:32]
     ]

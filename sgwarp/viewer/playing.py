@@ -29,9 +29,8 @@ class Player:
         self._ended.set()
 
     def _work(self) -> None:
-        while not self._ended.wait(self._pause):
-            try:
+        try:
+            while not self._ended.wait(self._pause):
                 self._step()
-            except Exception:  # a frame that cannot be read; the picture tells it
-                logger.exception("viewer: playing ended")
-                return
+        except Exception:
+            logger.exception("viewer: playing ended")

@@ -93,7 +93,7 @@ class Answers:
 
     @property
     def first(self) -> int | None:
-        """The first query that means something to the encoder, which histogram and list are about; None if none does."""
+        """The first query that means something to the encoder; histogram and list are about it. None if none does."""
         known = self.scores.known.nonzero().flatten().tolist()
         return known[0] if known else None
 

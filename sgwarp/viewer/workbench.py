@@ -158,8 +158,8 @@ class Workbench:
         """
         if self.frames > 1:
             raise InputError(
-                f"{operation.name}: a moving scene can be looked at and asked, not edited; open one frame of it (save the "
-                "one that is shown as Scene (PLY))"
+                f"{operation.name}: a moving scene can be looked at and asked, not edited; save the frame that is "
+                "shown as Scene (PLY), and open that"
             )
 
     def apply(self, term: str, operation: Operation) -> str:

@@ -3,9 +3,11 @@
 import http.client
 import logging
 import socket
+import threading
 
 import pytest
 
+from sgwarp.apps.editing.operations import Remove
 from sgwarp.errors import InputError
 from sgwarp.viewer.server import Address, Viewer, open_viewer
 
@@ -245,6 +247,59 @@ def test_tabs_come_and_go(make_viewer):
         client.socket.close()
     assert _until(lambda: len(viewer.tabs) == 1)
     assert _until(lambda: len(viewer.streamer._streams) == 1)
+
+
+def test_a_tab_too_many_is_told(make_viewer, monkeypatch):
+    from sgwarp.viewer import server
+
+    monkeypatch.setattr(server, "MOST_TABS", 2)
+    viewer = make_viewer()
+    for _ in range(2):
+        client = Client(viewer)
+        client.look()
+        picture(client)
+    third = Client(viewer)
+    third.look()
+    assert "Too many tabs" in str(third.wait_for("NotificationShowMessage"))
+    assert len(viewer.tabs) == 2
+
+
+def test_a_key_does_what_its_command_says(make_viewer, stage):
+    viewer = make_viewer()
+    client = Client(viewer)
+    client.look()
+    commands = (message for message in client.messages if message["type"] == "RegisterCommandMessage")
+    undo = next(command["uuid"] for command in commands if command["props"]["label"] == "Undo")
+    client.send("CommandTriggerMessage", uuid="x" * 10**5)
+    client.send("CommandTriggerMessage", uuid=undo)
+    assert "no step was applied" in str(client.wait_for("NotificationShowMessage"))
+    viewer.bench.apply("rows:0-9", Remove())
+    client.send("CommandTriggerMessage", uuid=undo)
+    assert _until(lambda: len(viewer.bench.state.gaussians) == len(stage.gaussians))
+
+
+def test_a_tab_that_leaves_in_the_middle_of_a_query_harms_nobody(make_viewer, bench, caplog):
+    asked, go_on = threading.Event(), threading.Event()
+    original = bench.asker.ask
+
+    def slow(*arguments):
+        asked.set()
+        assert go_on.wait(60)
+        return original(*arguments)
+
+    bench.asker.ask = slow
+    viewer = make_viewer()
+    client = Client(viewer)
+    client.look()
+    client.send("GuiUpdateMessage", uuid=client.wait_for_query_box(), updates={"value": "lamp"})
+    assert asked.wait(60)
+    client.socket.close()
+    assert _until(lambda: not viewer.tabs)
+    go_on.set()
+    other = Client(viewer)
+    other.look()
+    assert picture(other).std() > 10
+    assert "Traceback" not in caplog.text
 
 
 def _until(ready) -> bool:
