@@ -114,6 +114,7 @@ class Panel:
             result = work()
         except InputError as error:
             self.tell(str(error), wrong=True)
+            self.refresh()  # the control shows what was refused
             return None
         except Exception as error:  # a fault of one tab must not end the program
             logger.exception("viewer: a control failed")
@@ -227,11 +228,18 @@ class Panel:
             self._on(gui.add_dropdown("Look from", stems), lambda stem: stem == "-" or self._aim(stem), redraw=False)
             self._on(gui.add_checkbox("Cameras of the views", False), self._show_cameras)
         self._button("Reset view", lambda: self._aim(""), "Look from where the page began (R).", redraw=False)
-        self._on(gui.add_checkbox("Splats in the browser", False), lambda value: self._splats(bool(value)))
+        self._drawn_there = self._on(gui.add_checkbox("Splats in the browser", False), self._draw_splats)
 
     def _show_cameras(self, wanted: bool) -> None:
         self._cameras(bool(wanted))
         self.tab.set_cameras(wanted)
+
+    def _draw_splats(self, wanted: bool) -> None:
+        try:
+            self._splats(bool(wanted))
+        except InputError:
+            self._drawn_there.value = False
+            raise
 
     def _play(self, wanted: bool) -> None:
         if self._player is not None:

@@ -235,6 +235,48 @@ def test_a_refused_value_is_told_and_changes_nothing(make_viewer):
     assert session.tab.answers is None
 
 
+def updates_of(client, uuid):
+    """New values that the program gives a control."""
+    updates = (message for message in client.messages if message["type"] == "GuiUpdateMessage")
+    return (update["updates"] for update in updates if update["uuid"] == uuid)
+
+
+def test_a_control_that_was_refused_goes_back(make_viewer, bench, monkeypatch):
+    from dataclasses import replace
+
+    bench.materials = replace(bench.materials, instances=None)
+    client = Client(make_viewer())
+    client.look()
+    mode = client.wait_for_control("GuiDropdownMessage", "Mode")
+    client.send("GuiUpdateMessage", uuid=mode, updates={"value": "instances"})
+    assert "--instances" in str(client.wait_for("NotificationShowMessage"))
+    assert next(updates_of(client, mode)) == {"value": "color"}
+
+    monkeypatch.setattr("sgwarp.viewer.splats.MOST_SPLATS", 10)
+    other = Client(make_viewer())
+    other.look()
+    box = other.wait_for_control("GuiCheckboxMessage", "Splats in the browser")
+    other.send("GuiUpdateMessage", uuid=box, updates={"value": True})
+    assert next(updates_of(other, box)) == {"value": False}
+    assert "too many for the browser" in str(other.wait_for("NotificationShowMessage"))
+
+
+def test_splats_stand_before_the_chosen_background(make_viewer):
+    import cv2
+    import numpy as np
+
+    client = Client(make_viewer())
+    client.look()
+    color = client.wait_for_control("GuiRgbMessage", "Background")
+    box = client.wait_for_control("GuiCheckboxMessage", "Splats in the browser")
+    client.send("GuiUpdateMessage", uuid=color, updates={"value": [10, 200, 30]})
+    client.send("GuiUpdateMessage", uuid=box, updates={"value": True})
+    client.wait_for("GaussianSplatsMessage")
+    pictures = (message for message in client.messages if message["type"] == "BackgroundImageMessage")
+    sent = (cv2.imdecode(np.frombuffer(message["rgb_data"], np.uint8), cv2.IMREAD_COLOR) for message in pictures)
+    assert next(one for one in sent if one.shape == (1, 1, 3)).tolist() == [[[30, 200, 10]]]
+
+
 def test_tabs_come_and_go(make_viewer):
     viewer = make_viewer()
     clients = [Client(viewer) for _ in range(3)]
