@@ -68,6 +68,7 @@ class View(SceneOptions):
             viewer.close()
 
     def _materials(self, log: RunLog) -> Materials:
+        from sgwarp.encoders.registry import image_tower_for
         from sgwarp.io.instances import load_instances
         from sgwarp.io.sequences import is_sequence, load_sequence
         from sgwarp.viewer.workbench import Materials
@@ -98,6 +99,7 @@ class View(SceneOptions):
             None if self.instances is None else load_instances(self.instances, gaussians),
             [] if self.views is None else self._views(gaussians),
             sequence,
+            None if encoder is None else image_tower_for(encoder.space, self.device),
         )
 
     def _maker(self, semantics: Semantics) -> Callable[[str | None], TextEncoder]:

@@ -6,6 +6,7 @@ import threading
 from collections import OrderedDict
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -39,6 +40,7 @@ class Materials:
         instances: Or None.
         views: Cameras to start from, and to tell what was looked at.
         sequence: The frames of a moving scene, or None.
+        make_tower: Makes what encodes images in the semantics' space, if the text encoder does not; or None.
     """
 
     gaussians: Gaussians
@@ -49,6 +51,7 @@ class Materials:
     instances: InstanceMap | None = None
     views: Sequence[View] = ()
     sequence: GaussianSequence | None = None
+    make_tower: Callable[[], Any] | None = None
 
 
 @dataclass(frozen=True, eq=False)
@@ -97,7 +100,7 @@ class Workbench:
     def _begin(self, given: Materials) -> None:
         context = EditContext(given.semantics, given.encoder, given.instances, given.views)
         self.session = EditSession(given.gaussians, context)
-        self.asker = Asker(given.semantics, given.encoder, given.predicted, given.with_templates)
+        self.asker = Asker(given.semantics, given.encoder, given.predicted, given.with_templates, given.make_tower)
 
     def subscribe(self, listener: Callable[[], None]) -> Callable[[], None]:
         """Have a function called after every change; returns one that ends this."""

