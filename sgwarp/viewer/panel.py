@@ -4,7 +4,6 @@ it."""
 from __future__ import annotations
 
 import contextlib
-import html
 import logging
 import threading
 from collections.abc import Callable, Iterator
@@ -18,6 +17,7 @@ from sgwarp.errors import InputError
 from sgwarp.viewer import bounds
 from sgwarp.viewer.clicks import Found
 from sgwarp.viewer.downloads import picture_file, scene_file, script_file, video_file
+from sgwarp.viewer.markup import as_plain, legend_rows, notice, score_table, score_text
 from sgwarp.viewer.modes import MODES
 from sgwarp.viewer.playing import Player
 from sgwarp.viewer.questions import HIGH, LOW, OWN
@@ -377,8 +377,8 @@ class Panel:
         tab, found = self.tab, self.tab.found
         self._mode.value = tab.look.mode
         self._strength.visible = tab.look.mode in ("features", "instances")  # the modes that it changes
-        self._info.content = NOTHING if found is None else _plain(found.sentence)
-        self._legend.content = _legend(tab.legend()) + _notice(tab.missing) + self._refresh_answers()
+        self._info.content = NOTHING if found is None else as_plain(found.sentence)
+        self._legend.content = legend_rows(tab.legend()) + notice(tab.missing) + self._refresh_answers()
 
     def _refresh_answers(self) -> str:
         """Histogram and best objects; these also as HTML."""
@@ -394,10 +394,10 @@ class Panel:
         self._histogram.data = (centers.numpy(), heights, np.where(reached, heights, 0.0))
         ranked = answers.rank(self.tab.bench.materials.instances, first)
         self._top.visible = bool(ranked)
-        options = ("-", *(f"{one.id} {one.name} {_score(one.score)}" for one in ranked))
+        options = ("-", *(f"{one.id} {one.name} {score_text(one.score)}" for one in ranked))
         if tuple(self._top.options) != options:
             self._top.options = options
-        return _table([(one.name, one.score) for one in ranked[:LISTED]])
+        return score_table([(one.name, one.score) for one in ranked[:LISTED]])
 
 
 def _color(values: Any) -> ops.Vector:
@@ -408,36 +408,3 @@ def _color(values: Any) -> ops.Vector:
 def _shift(values: Any) -> ops.Vector:
     x, y, z = bounds.numbers("shift", values, 3, bounds.FAR_AWAY)
     return x, y, z
-
-
-def _legend(rows: list[tuple[str, str]]) -> str:
-    lines = [
-        f'<div><span style="display:inline-block;width:0.9em;height:0.9em;background:{color};'
-        f'border:1px solid #868e96;margin-right:0.5em">'
-        f"</span>{html.escape(name)}</div>"
-        for name, color in rows[:32]
-    ]
-    return f'<div style="padding:0 1em;font-size:0.85em">{"".join(lines)}</div>' if lines else ""
-
-
-def _table(rows: list[tuple[str, float]]) -> str:
-    """Names with scores, and a bar of each score."""
-    lines = [
-        f'<tr><td>{html.escape(name)}</td><td style="width:40%"><div style="height:0.6em;background:#e8590c;'
-        f'width:{100 * min(max(score, 0.0), 1.0):.0f}%"></div></td><td>{_score(score)}</td></tr>'
-        for name, score in rows
-    ]
-    return f'<table style="margin:0.3em 1em;width:90%;font-size:0.85em">{"".join(lines)}</table>' if lines else ""
-
-
-def _score(value: float) -> str:
-    return f"{round(value, 2) + 0.0:.2f}"  # no -0.00
-
-
-def _notice(text: str) -> str:
-    return f'<div style="padding:0 1em;font-size:0.85em">{html.escape(text)}</div>' if text else ""
-
-
-def _plain(text: str) -> str:
-    """Text that Markdown shows as it is."""
-    return "".join(f"\\{letter}" if letter in "\\`*_{}[]<>()#+!|~" else letter for letter in text)
