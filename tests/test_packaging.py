@@ -134,6 +134,7 @@ def test_an_install_without_hashes_fails(monkeypatch, capsys):
     monkeypatch.setattr(install, "_install", lambda wanted: install._install_hashed([("torch", "0.0")]))
     assert install.main("demo") == 1
     assert "has no hashes of torch==0.0; run make lock" in capsys.readouterr().err
+    assert "export HASHED=1" in (ROOT / ".ci" / "run").read_text()
 
 
 def test_the_lock_has_hashes_of_every_pin():
