@@ -4,16 +4,19 @@ from __future__ import annotations
 
 import csv
 import glob
+import os
 import shlex
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 
 from sgwarp.errors import InputError
+from sgwarp.files.access import read_bytes
 
 RESERVED = ("shards",)  # folders of the output that are no scenes
 POINTS = ("points3D.ply", "sparse_pc.ply", "point_cloud.ply")  # of data sets, to start a fit from
 MAGIC = ("*", "?", "[")
+LARGEST = 1 << 26  # bytes of a list
 
 
 @dataclass(frozen=True)
@@ -44,12 +47,12 @@ def list_scenes(source: str) -> list[Scene]:
     """
     path = Path(source)
     found: list[tuple[str, Path, dict[str, str]]]
-    if path.is_dir():
+    if os.path.isdir(path):
         entries = sorted(p for p in path.iterdir() if p.name[0] != "." and (p.is_dir() or p.suffix == ".ply"))
         found = [(_name(p), p, {}) for p in entries]
-    elif path.suffix == ".csv" and path.is_file():
+    elif path.suffix == ".csv" and os.path.isfile(path):
         found = list(_csv_rows(path))
-    elif path.is_file():
+    elif os.path.isfile(path):
         found = list(_text_lines(path))
     elif any(mark in source for mark in MAGIC):
         matches = sorted(map(Path, glob.glob(source, recursive=True)))
@@ -92,6 +95,13 @@ def parse_shard(shard: str) -> tuple[int, int]:
 
 def _csv_rows(path: Path) -> Iterator[tuple[str, Path, dict[str, str]]]:
     rows = csv.DictReader(_read(path).splitlines())
+    try:
+        yield from _scenes_of(path, rows)
+    except csv.Error as error:  # of a cell without end, for one
+        raise InputError(f"{path}: line {rows.line_num} cannot be read ({error}); quote cells in pairs") from None
+
+
+def _scenes_of(path: Path, rows: csv.DictReader[str]) -> Iterator[tuple[str, Path, dict[str, str]]]:
     if "path" not in (rows.fieldnames or ()):
         raise InputError(f"{path}: has no column 'path'; its first line names the columns: path,name,fit.steps,...")
     for row in rows:
@@ -123,8 +133,8 @@ def _text_lines(path: Path) -> Iterator[tuple[str, Path, dict[str, str]]]:
 
 def _read(path: Path) -> str:
     try:
-        return path.read_text(encoding="utf-8-sig")
-    except (OSError, UnicodeDecodeError) as error:
+        return read_bytes(path, LARGEST).decode("utf-8-sig")
+    except UnicodeDecodeError as error:
         raise InputError(f"{path}: cannot be read as text ({error}); a list is UTF-8 text") from None
 
 
