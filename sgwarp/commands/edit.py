@@ -100,6 +100,8 @@ class Edit(SceneOptions):
             raise InputError(f"--out {self.out}: is the scene itself; choose another name")
         if self.view is not None and self.views is None:
             raise InputError(f"--view {self.view}: needs --views, the folder that holds it")
+        if self.encoder is not None and self.semantics is None:
+            raise InputError(f"--encoder {self.encoder}: needs --semantics, what `sgwarp lift` wrote for this scene")
         with self.logged(self.out.parent) as log:
             from sgwarp.apps.editing.script import load_script, save_script
             from sgwarp.apps.editing.session import edit

@@ -131,19 +131,32 @@ def score_text(text: str, selection: Selection, context: EditContext) -> Tensor:
         if named is not None:
             return named
         raise InputError(f"select '{text}': needs --semantics, what `sgwarp lift` wrote for this scene")
+    asked = [text, *selection.negatives]
     if semantics.labels is not None:
-        return class_votes(semantics, [text])[:, 0] > selection.threshold
-    if context.encoder is None:
-        raise InputError(f"select '{text}': needs the text encoder of space '{semantics.space}'")
-    answers = score_texts(semantics, [text, *selection.negatives], context.encoder)
-    if not bool(answers.known[0]):
-        raise InputError(f"select '{text}': the encoder knows nothing like it; choose another word")
-    scores = answers.evidence
-    assert scores is not None
+        scores, least = class_votes(semantics, asked), selection.threshold
+        fits = scores[:, 0] > least
+    else:
+        if context.encoder is None:
+            raise InputError(f"select '{text}': needs the text encoder of space '{semantics.space}'")
+        answers = score_texts(semantics, asked, context.encoder)
+        if not bool(answers.known[0]):
+            raise InputError(f"select '{text}': the encoder knows nothing like it; choose another word")
+        assert answers.evidence is not None
+        scores, least = answers.evidence, 0.0
+        fits = (answers.values[:, 0] > selection.threshold) & (scores[:, 0] > answers.level)
+        if context.instances is None:
+            _require_evidence(text, float(scores[:, 0].max()), answers.level)
     rivals = scores[:, 1:].max(dim=1).values if selection.negatives else torch.full_like(scores[:, 0], -torch.inf)
     if context.instances is not None:
-        return _name_instances(scores[:, 0], rivals, semantics.seen, context.instances)
-    return (answers.values[:, 0] > selection.threshold) & (scores[:, 0] > rivals)
+        return _name_instances(scores[:, 0], rivals, semantics.seen, context.instances, least)
+    return fits & (scores[:, 0] > rivals)
+
+
+def _require_evidence(text: str, best: float, level: float) -> None:
+    """Raise InputError if nothing shows what a text names: rescaled scores have a best place all the same."""
+    if best <= level:
+        found = f"nothing stands out as that (evidence {best:.2f}, and this encoder needs more than {level:.2f})"
+        raise InputError(f"select '{text}': {found}; select it by click:, id: or box:, or give --instances")
 
 
 def _named(text: str, instances: InstanceMap | None) -> Tensor | None:
@@ -154,15 +167,17 @@ def _named(text: str, instances: InstanceMap | None) -> Tensor | None:
     return torch.stack([instances.members(row.id) for row in found]).any(dim=0)
 
 
-def _name_instances(scores: Tensor, rivals: Tensor, seen: Tensor, instances: InstanceMap) -> Tensor:
-    """Members of the instances whose Gaussians score best on the mean, bool [N]; none if the best is below the mean."""
+def _name_instances(
+    scores: Tensor, rivals: Tensor, seen: Tensor, instances: InstanceMap, least: float = 0.0
+) -> Tensor:
+    """Members of the instances whose Gaussians score best on the mean, bool [N]; none that score `least` or less."""
     ids = instances.instance().to(scores.device).clamp(min=0)
     ids = torch.where(seen.to(scores.device), ids, 0)
     count = len(instances.table) + 1
     size = torch.bincount(ids, minlength=count).clamp(min=1)
     mean = torch.bincount(ids, weights=scores.double(), minlength=count) / size
     rival = torch.bincount(ids, weights=rivals.double(), minlength=count) / size
-    able = (mean > 0) & (mean > rival)
+    able = (mean > least) & (mean > rival)
     able[0] = False
     best = mean[able].max() if bool(able.any()) else torch.inf
     chosen = able & (mean >= SAME * best)

@@ -17,6 +17,7 @@ A selection is a list of terms, each a short text:
 from __future__ import annotations
 
 import math
+import sys
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, fields
 from typing import Any
@@ -68,10 +69,16 @@ class Selection:
             raise InputError("negatives: a phrase is empty")
         for name in ("threshold", "grow"):
             value = getattr(self, name)
-            if isinstance(value, bool) or not isinstance(value, (int, float)) or not math.isfinite(value):
-                raise InputError(f"{name}: expected a finite number, got {value!r}")
+            if not is_number(value):
+                raise InputError(f"{name}: expected a finite number, got {str(value)[:40]}")
         if not isinstance(self.clean, bool):
             raise InputError(f"clean: expected true or false, got {self.clean!r}")
+
+
+def is_number(value: Any) -> bool:
+    """Whether something is a number that a float can hold; whole numbers of a file may be of any length."""
+    largest = sys.float_info.max
+    return isinstance(value, (int, float)) and not isinstance(value, bool) and -largest <= value <= largest
 
 
 def parse_term(term: str) -> Term:
