@@ -5,7 +5,7 @@ import dataclasses
 import pytest
 import torch
 
-from sgwarp.apps.editing.picker import EditContext
+from sgwarp.apps.editing.picker import EditContext, spread
 from sgwarp.apps.editing.selection import Selection
 from sgwarp.apps.editing.session import EditSession
 from sgwarp.encoders.calibration import Calibration
@@ -87,3 +87,39 @@ def test_what_nothing_shows_is_not_selected_by_its_best_place(stage, toy_text, i
         picked(stage, strict, "book")
     among = dataclasses.replace(strict, instances=instances)
     assert torch.equal(picked(stage, among, "book"), stage.classes == 4), "of given objects one is the best"
+
+
+def test_each_term_is_cleaned_by_itself(stage):
+    """A few rows beside a wall of thousands: small as a piece of both, whole as a term."""
+    book = (stage.classes == 4).nonzero().flatten()[:9].tolist()
+    terms = ("box:-9,-9,3.9,9,9,9", f"rows:{book[0]}-{book[-1]}")
+    alone = [EditSession(stage.gaussians).preview(Selection((term,))) for term in terms]
+    assert int(alone[1].sum()) == 9 < int(alone[0].sum()) / 10
+    assert torch.equal(EditSession(stage.gaussians).preview(Selection(terms)), alone[0] | alone[1])
+
+
+def test_what_is_connected_belongs_to_it_from_half_the_threshold_on():
+    """Two rows of Gaussians, 1 mm apart in a row: one with a peak, one as high as the slopes of the first."""
+    at = 0.001 * torch.arange(40.0)
+    means = torch.cat([torch.stack([at, torch.full((40,), y), torch.zeros(40)], dim=1) for y in (0.0, 1.0)])
+    scores = torch.cat([torch.linspace(0.0, 1.0, 40), torch.full((40,), 0.4)])
+    chosen = spread(means, scores > 0.5, scores > 0.25)
+    assert torch.equal(chosen, (scores > 0.25) & (means[:, 1] == 0))
+    nothing = torch.zeros(80, dtype=torch.bool)
+    assert torch.equal(spread(means, nothing, scores > 0.25), nothing)
+    assert torch.equal(spread(means, scores > 0.5, nothing), scores > 0.5)
+
+
+def test_a_text_takes_what_is_connected_with_its_best(stage, toy_text):
+    """Panels whose features turn from the book's to the wall's: the book at both thresholds, the rest by half."""
+    features = torch.nn.functional.one_hot(stage.classes - 1, 5).float()
+    lamp = stage.classes == 3
+    left = lamp & (stage.gaussians.means[:, 0] < stage.gaussians.means[lamp, 0].median())
+    features[left] = 0.4 * features[left]  # a lamp by 0.4, seen as little else
+    features[left, 4] = 0.9165
+    weight = torch.ones(len(features))
+    semantics = Semantics(features, weight, weight, "toy", stage.gaussians.fingerprint)
+    session = EditSession(stage.gaussians, EditContext(semantics, Faint(toy_text, 0.0)))
+    strong = session.preview(Selection(("lamp",), threshold=0.9, negatives=("wall",)))
+    assert torch.equal(strong, lamp & ~left)
+    assert torch.equal(session.preview(Selection(("lamp",), threshold=0.5, negatives=("wall",))), lamp)

@@ -45,9 +45,10 @@ class Selection:
         select: Terms; what any of them selects.
         keep: Terms whose Gaussians are never selected.
         negatives: Phrases that a Gaussian must fit less than the text.
-        threshold: Least score of a text, where 0 is the scene's median and 1 its best thousandth.
+        threshold: Least score of a text, where 0 is the scene's median and 1 its best thousandth. What is connected with
+            such Gaussians and scores more than half of it belongs to them.
         grow: Add what lies within this distance, or if negative take away what lies within it of the rest [m].
-        clean: Leave out scattered pieces that hold less than a tenth of the largest one.
+        clean: Leave out scattered pieces of each term that hold less than a tenth of its largest one.
 
     Raises:
         InputError: A term is malformed, or a number not finite.
