@@ -24,7 +24,9 @@ def files(stage, stage_files, tmp_path_factory):
     folder = tmp_path_factory.mktemp("odd")
     instances, semantics, edited = folder / "i.safetensors", folder / "s.safetensors", folder / "edited.ply"
     views = ["--views", stage_files.views]
-    assert not runs("instances", stage_files.scene, *views, "--masks", f"files:{stage_files.labels}", "--out", instances)
+    assert not runs(
+        "instances", stage_files.scene, *views, "--masks", f"files:{stage_files.labels}", "--out", instances
+    )
     save_semantics(lift(stage_files.gaussians, stage.views, stage.dense), semantics)
     assert not runs("edit", stage_files.scene, "--out", edited, "--select", "box:-9,-9,2.9,9,9,3.1", "--scale", 2)
     return folder

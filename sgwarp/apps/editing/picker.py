@@ -93,9 +93,7 @@ def _advice(selection: Selection) -> str:
     return "choose another term, or keep and shrink less"
 
 
-def _pick_clean(
-    state: EditState, term: Term, selection: Selection, context: EditContext, free: Tensor
-) -> Tensor:
+def _pick_clean(state: EditState, term: Term, selection: Selection, context: EditContext, free: Tensor) -> Tensor:
     """What a term selects among some Gaussians, without its scattered pieces, bool [N]."""
     means, around = state.gaussians.means, None
     if term.kind == "text":
@@ -190,9 +188,7 @@ def _named(text: str, instances: InstanceMap | None) -> Tensor | None:
     return torch.stack([instances.members(row.id) for row in found]).any(dim=0)
 
 
-def _name_instances(
-    scores: Tensor, rivals: Tensor, seen: Tensor, instances: InstanceMap, least: float = 0.0
-) -> Tensor:
+def _name_instances(scores: Tensor, rivals: Tensor, seen: Tensor, instances: InstanceMap, least: float = 0.0) -> Tensor:
     """Members of the instances whose Gaussians score best on the mean, bool [N]; none that score `least` or less."""
     ids = instances.instance().to(scores.device).clamp(min=0)
     ids = torch.where(seen.to(scores.device), ids, 0)

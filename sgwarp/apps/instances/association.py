@@ -202,9 +202,7 @@ class _Groups:
         share = graph.shared / np.minimum(own[first], own[second])
         features = None if graph.features is None else graph.features.copy()
         blank = np.zeros(len(first))
-        groups = cls(
-            first, second, graph.shared.copy(), share, blank, masks, graph.visible.copy(), members, features
-        )
+        groups = cls(first, second, graph.shared.copy(), share, blank, masks, graph.visible.copy(), members, features)
         both = graph.visible[first, view_of[second]] + graph.visible[second, view_of[first]]
         groups._compare(np.arange(len(first)), both, settings)
         return groups
