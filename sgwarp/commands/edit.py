@@ -34,7 +34,8 @@ class Edit(SceneOptions):
     """Phrases that a Gaussian or instance must fit less than the text."""
 
     threshold: float = 0.5
-    """Least score of a text without instances, where 0 is the scene's median score and 1 its best thousandth."""
+    """Least score of a text without instances, where 0 is the scene's median score and 1 its best thousandth; what is
+    connected with such Gaussians belongs to them from half of it on. For lifted label images, least share of a label."""
 
     grow: float = 0.0
     """Add what lies within this distance of the selection; negative numbers shrink it [scene units]."""

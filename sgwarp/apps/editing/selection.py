@@ -45,8 +45,8 @@ class Selection:
         select: Terms; what any of them selects.
         keep: Terms whose Gaussians are never selected.
         negatives: Phrases that a Gaussian must fit less than the text.
-        threshold: Least score of a text, where 0 is the scene's median and 1 its best thousandth. What is connected with
-            such Gaussians and scores more than half of it belongs to them.
+        threshold: Least score of a text, where 0 is the scene's median and 1 its best thousandth. What scores more than
+            half of it and is connected with such Gaussians belongs to them.
         grow: Add what lies within this distance, or if negative take away what lies within it of the rest [m].
         clean: Leave out scattered pieces of each term that hold less than a tenth of its largest one.
 

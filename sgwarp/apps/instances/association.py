@@ -88,7 +88,7 @@ def _sample_limits(
     sampled = (sizes > samples) & (samples > 0)
     if not sampled.any():
         return limits
-    # Priorities are uniform, so the wanted one is near samples / size: only the pairs below a generous guess are sorted.
+    # Priorities are uniform, so the wanted one is near samples / size: only pairs below a generous guess are sorted.
     guess = np.where(sampled, (samples + 8 * samples**0.5) / np.maximum(sizes, 1), -1.0)
     low = chance <= guess[mask]
     guess[sampled & (np.bincount(mask[low], minlength=count) < samples)] = 1.0
