@@ -92,8 +92,8 @@ def _sample_limits(
     guess = np.where(sampled, (samples + 8 * samples**0.5) / np.maximum(sizes, 1), -1.0)
     low = chance <= guess[mask]
     guess[sampled & (np.bincount(mask[low], minlength=count) < samples)] = 1.0
-    low = np.flatnonzero(chance <= guess[mask])
-    order = low[np.lexsort((chance[low], mask[low]))]
+    wanted = np.flatnonzero(chance <= guess[mask])
+    order = wanted[np.lexsort((chance[wanted], mask[wanted]))]
     starts = np.searchsorted(mask[order], np.flatnonzero(sampled))
     limits[sampled] = chance[order[starts + samples - 1]]
     return limits
