@@ -35,7 +35,7 @@ class Edit(SceneOptions):
 
     threshold: float = 0.5
     """Least score of a text without instances, where 0 is the scene's median score and 1 its best thousandth; what is
-    connected with such Gaussians belongs to them from half of it on. For lifted label images, least share of a label."""
+    connected with such Gaussians belongs to them from half of it on. For lifted label images, least share of one."""
 
     grow: float = 0.0
     """Add what lies within this distance of the selection; negative numbers shrink it [scene units]."""
