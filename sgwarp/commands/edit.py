@@ -34,7 +34,8 @@ class Edit(SceneOptions):
     """Phrases that a Gaussian or instance must fit less than the text."""
 
     threshold: float = 0.5
-    """Least score of a text without instances, where 0 is the scene's median score and 1 its best thousandth."""
+    """Least score of a text without instances, where 0 is the scene's median score and 1 its best thousandth; what is
+    connected with such Gaussians belongs to them from half of it on. For lifted label images, least share of one."""
 
     grow: float = 0.0
     """Add what lies within this distance of the selection; negative numbers shrink it [scene units]."""
@@ -100,6 +101,8 @@ class Edit(SceneOptions):
             raise InputError(f"--out {self.out}: is the scene itself; choose another name")
         if self.view is not None and self.views is None:
             raise InputError(f"--view {self.view}: needs --views, the folder that holds it")
+        if self.encoder is not None and self.semantics is None:
+            raise InputError(f"--encoder {self.encoder}: needs --semantics, what `sgwarp lift` wrote for this scene")
         with self.logged(self.out.parent) as log:
             from sgwarp.apps.editing.script import load_script, save_script
             from sgwarp.apps.editing.session import edit

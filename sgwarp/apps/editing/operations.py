@@ -14,6 +14,7 @@ from typing import Any, ClassVar
 import torch
 from torch import Tensor
 
+from sgwarp.apps.editing.selection import is_number
 from sgwarp.errors import InputError
 from sgwarp.ops.planar.harmonics_rotation import rotate_harmonics
 from sgwarp.scene import Gaussians
@@ -345,8 +346,8 @@ def _vector(what: str, name: str, value: Any) -> Vector:
 
 
 def _number(what: str, name: str, value: Any) -> None:
-    if isinstance(value, bool) or not isinstance(value, (int, float)) or not math.isfinite(value):
-        raise InputError(f"{what}: {name}: expected a finite number, got {value!r}")
+    if not is_number(value):
+        raise InputError(f"{what}: {name}: expected a finite number, got {str(value)[:40]}")
 
 
 def _plain(value: Any) -> Any:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 import torch
@@ -21,6 +21,7 @@ from sgwarp.scene import Camera, Gaussians, InstanceMap, Semantics, View
 NEIGHBORS = 8  # of a Gaussian when pieces are told apart
 LINK = 4.0  # neighbors farther apart than this many median distances belong to different pieces
 LEAST_PIECE = 0.1  # share of the largest piece that another one must have to stay
+HALF = 0.5  # of the threshold: what scores more belongs to a selection that it is connected with
 SAME = 0.8  # share of the best instance's score that another instance must have to be named by the same text
 CLICK_DEPTH = 8  # Gaussians of a pixel that a click asks
 LOOKS_ALIKE = 0.9  # cosine to what was clicked at
@@ -74,13 +75,11 @@ def pick(state: EditState, selection: Selection, context: EditContext) -> Tensor
     """
     chosen = torch.zeros(len(state.gaussians), dtype=torch.bool, device=state.gaussians.device)
     kept = torch.zeros_like(chosen)
-    for term in selection.select:
-        chosen |= _pick_term(state, parse_term(term), selection, context)
+    as_it_is = replace(selection, clean=False)
     for term in selection.keep:
-        kept |= _pick_term(state, parse_term(term), selection, context)
-    chosen &= ~kept
-    if selection.clean and bool(chosen.any()):
-        chosen = largest_pieces(state.gaussians.means, chosen)
+        kept |= _pick_clean(state, parse_term(term), as_it_is, context, ~kept)
+    for term in selection.select:
+        chosen |= _pick_clean(state, parse_term(term), selection, context, ~kept)
     if selection.grow and bool(chosen.any()):
         chosen = grow(state.gaussians.means, chosen, selection.grow) & ~kept
     if not bool(chosen.any()):
@@ -94,7 +93,23 @@ def _advice(selection: Selection) -> str:
     return "choose another term, or keep and shrink less"
 
 
-def _pick_term(state: EditState, term: Term, selection: Selection, context: EditContext) -> Tensor:
+def _pick_clean(state: EditState, term: Term, selection: Selection, context: EditContext, free: Tensor) -> Tensor:
+    """What a term selects among some Gaussians, without its scattered pieces, bool [N]."""
+    means, around = state.gaussians.means, None
+    if term.kind == "text":
+        chosen, around = score_text(term.text, selection, context)
+        chosen = chosen.to(state.rows.device)[state.rows]
+        around = None if around is None else around.to(state.rows.device)[state.rows]
+    else:
+        chosen = _pick_term(state, term, context)
+    chosen = chosen & free
+    if selection.clean and bool(chosen.any()):
+        chosen = largest_pieces(means, chosen)
+    return chosen if around is None else spread(means, chosen, around & free)
+
+
+def _pick_term(state: EditState, term: Term, context: EditContext) -> Tensor:
+    """What a term that is no text selects, bool [N]."""
     gaussians = state.gaussians
     if term.kind == "all":
         return torch.ones(len(gaussians), dtype=torch.bool, device=gaussians.device)
@@ -113,37 +128,56 @@ def _pick_term(state: EditState, term: Term, selection: Selection, context: Edit
         return _pick_rows(state, term)
     if term.kind == "click":
         return _pick_click(state, term, context)
-    if term.kind == "id":
-        if context.instances is None:
-            raise InputError(f"select id:{term.numbers[0]:g}: needs --instances, what `sgwarp instances` wrote")
-        return context.instances.members(int(term.numbers[0])).to(state.rows.device)[state.rows]
-    return score_text(term.text, selection, context).to(state.rows.device)[state.rows]
+    if context.instances is None:
+        raise InputError(f"select id:{term.numbers[0]:g}: needs --instances, what `sgwarp instances` wrote")
+    return context.instances.members(int(term.numbers[0])).to(state.rows.device)[state.rows]
 
 
-def score_text(text: str, selection: Selection, context: EditContext) -> Tensor:
-    """Gaussians of the scene as loaded that a text names, bool [N].
+def score_text(text: str, selection: Selection, context: EditContext) -> tuple[Tensor, Tensor | None]:
+    """Gaussians of the scene as loaded that a text names.
 
     Where instances are known a text names whole ones: that with the best mean score, and those that come close to it.
+
+    Returns:
+        chosen: Those that score more than the threshold, bool [N].
+        around: Those that belong to it where they are connected with it, bool [N]: they score more than half the
+            threshold; None if the first is all.
     """
     semantics = context.semantics
     if semantics is None:
         named = _named(text, context.instances)
         if named is not None:
-            return named
+            return named, None
         raise InputError(f"select '{text}': needs --semantics, what `sgwarp lift` wrote for this scene")
+    asked = [text, *selection.negatives]
     if semantics.labels is not None:
-        return class_votes(semantics, [text])[:, 0] > selection.threshold
-    if context.encoder is None:
-        raise InputError(f"select '{text}': needs the text encoder of space '{semantics.space}'")
-    answers = score_texts(semantics, [text, *selection.negatives], context.encoder)
-    if not bool(answers.known[0]):
-        raise InputError(f"select '{text}': the encoder knows nothing like it; choose another word")
-    scores = answers.evidence
-    assert scores is not None
+        scores, least, low = class_votes(semantics, asked), selection.threshold, None
+        high = scores[:, 0] > least
+    else:
+        if context.encoder is None:
+            raise InputError(f"select '{text}': needs the text encoder of space '{semantics.space}'")
+        answers = score_texts(semantics, asked, context.encoder)
+        if not bool(answers.known[0]):
+            raise InputError(f"select '{text}': the encoder knows nothing like it; choose another word")
+        assert answers.evidence is not None
+        scores, least = answers.evidence, 0.0
+        if context.instances is None:
+            _require_evidence(text, float(scores[:, 0].max()), answers.level)
+        stands_out = scores[:, 0] > answers.level
+        high = stands_out & (answers.values[:, 0] > selection.threshold)
+        low = stands_out & (answers.values[:, 0] > HALF * selection.threshold)
     rivals = scores[:, 1:].max(dim=1).values if selection.negatives else torch.full_like(scores[:, 0], -torch.inf)
     if context.instances is not None:
-        return _name_instances(scores[:, 0], rivals, semantics.seen, context.instances)
-    return (answers.values[:, 0] > selection.threshold) & (scores[:, 0] > rivals)
+        return _name_instances(scores[:, 0], rivals, semantics.seen, context.instances, least), None
+    fits = scores[:, 0] > rivals
+    return high & fits, None if low is None else low & fits
+
+
+def _require_evidence(text: str, best: float, level: float) -> None:
+    """Raise InputError if nothing shows what a text names: rescaled scores have a best place all the same."""
+    if best <= level:
+        found = f"nothing stands out as that (evidence {best:.2f}, and this encoder needs more than {level:.2f})"
+        raise InputError(f"select '{text}': {found}; select it by click:, id: or box:, or give --instances")
 
 
 def _named(text: str, instances: InstanceMap | None) -> Tensor | None:
@@ -154,15 +188,15 @@ def _named(text: str, instances: InstanceMap | None) -> Tensor | None:
     return torch.stack([instances.members(row.id) for row in found]).any(dim=0)
 
 
-def _name_instances(scores: Tensor, rivals: Tensor, seen: Tensor, instances: InstanceMap) -> Tensor:
-    """Members of the instances whose Gaussians score best on the mean, bool [N]; none if the best is below the mean."""
+def _name_instances(scores: Tensor, rivals: Tensor, seen: Tensor, instances: InstanceMap, least: float = 0.0) -> Tensor:
+    """Members of the instances whose Gaussians score best on the mean, bool [N]; none that score `least` or less."""
     ids = instances.instance().to(scores.device).clamp(min=0)
     ids = torch.where(seen.to(scores.device), ids, 0)
     count = len(instances.table) + 1
     size = torch.bincount(ids, minlength=count).clamp(min=1)
     mean = torch.bincount(ids, weights=scores.double(), minlength=count) / size
     rival = torch.bincount(ids, weights=rivals.double(), minlength=count) / size
-    able = (mean > 0) & (mean > rival)
+    able = (mean > least) & (mean > rival)
     able[0] = False
     best = mean[able].max() if bool(able.any()) else torch.inf
     chosen = able & (mean >= SAME * best)
@@ -270,6 +304,17 @@ def largest_pieces(means: Tensor, chosen: Tensor) -> Tensor:
     sizes = np.bincount(piece[piece >= 0], minlength=1)
     large = np.append(sizes >= LEAST_PIECE * sizes.max(), False)  # the last entry is for -1
     return torch.from_numpy(large[piece]).to(chosen.device)
+
+
+def spread(means: Tensor, chosen: Tensor, around: Tensor) -> Tensor:
+    """The selection with the connected pieces of what is around it, bool [N] (two thresholds, as Canny's, 1986)."""
+    if not bool(chosen.any()):
+        return chosen
+    piece = torch.from_numpy(pieces(means, chosen | around)).to(chosen.device)
+    met = torch.zeros(int(piece.max()) + 2, dtype=torch.bool, device=chosen.device)  # the last entry is for -1
+    met[piece[chosen]] = True
+    met[-1] = False
+    return met[piece] | chosen
 
 
 def grow(means: Tensor, chosen: Tensor, distance: float) -> Tensor:

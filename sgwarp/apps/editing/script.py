@@ -75,8 +75,11 @@ def load_script(path: str | os.PathLike[str], gaussians: Gaussians | None = None
     content = read_json(path)
     if not isinstance(content, dict) or content.get("format") != FORMAT:
         raise InputError(f'{path}: is no edit script; it must hold "format": "{FORMAT}"')
-    if content.get("version") != VERSION:
+    if content.get("version") is not VERSION:
         raise InputError(f"{path}: has version {content.get('version')}, this program reads {VERSION}; update it")
+    unknown = sorted(set(content) - {"format", "version", "scene", "steps"})
+    if unknown:
+        raise InputError(f"{path}: has no entry '{unknown[0]}'; known are format, version, scene, steps")
     steps = content.get("steps")
     if not isinstance(steps, list) or not steps:
         raise InputError(f"{path}: steps: expected a list of at least one step")

@@ -17,6 +17,7 @@ A selection is a list of terms, each a short text:
 from __future__ import annotations
 
 import math
+import sys
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, fields
 from typing import Any
@@ -44,9 +45,10 @@ class Selection:
         select: Terms; what any of them selects.
         keep: Terms whose Gaussians are never selected.
         negatives: Phrases that a Gaussian must fit less than the text.
-        threshold: Least score of a text, where 0 is the scene's median and 1 its best thousandth.
+        threshold: Least score of a text, where 0 is the scene's median and 1 its best thousandth. What scores more than
+            half of it and is connected with such Gaussians belongs to them.
         grow: Add what lies within this distance, or if negative take away what lies within it of the rest [m].
-        clean: Leave out scattered pieces that hold less than a tenth of the largest one.
+        clean: Leave out scattered pieces of each term that hold less than a tenth of its largest one.
 
     Raises:
         InputError: A term is malformed, or a number not finite.
@@ -68,10 +70,16 @@ class Selection:
             raise InputError("negatives: a phrase is empty")
         for name in ("threshold", "grow"):
             value = getattr(self, name)
-            if isinstance(value, bool) or not isinstance(value, (int, float)) or not math.isfinite(value):
-                raise InputError(f"{name}: expected a finite number, got {value!r}")
+            if not is_number(value):
+                raise InputError(f"{name}: expected a finite number, got {str(value)[:40]}")
         if not isinstance(self.clean, bool):
             raise InputError(f"clean: expected true or false, got {self.clean!r}")
+
+
+def is_number(value: Any) -> bool:
+    """Whether something is a number that a float can hold; whole numbers of a file may be of any length."""
+    largest = sys.float_info.max
+    return isinstance(value, (int, float)) and not isinstance(value, bool) and -largest <= value <= largest
 
 
 def parse_term(term: str) -> Term:

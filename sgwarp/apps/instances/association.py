@@ -24,6 +24,7 @@ from sgwarp.apps.instances.settings import InstanceSettings
 
 BLOCK = 1024  # masks whose overlaps with all others are in memory at a time
 PAIRS = 1 << 18  # pairs of groups compared at a time
+SPARE = 0.25  # share of dropped pairs from which on the others are moved together
 FAINT = 0.01  # overlaps below this share of the smaller mask are not kept
 
 
@@ -65,15 +66,37 @@ def sampling_rates(views: Sequence[ViewEvidence], level: str, count: int, sample
     rates = np.zeros(count)
     chance = priorities(count)
     for view in views:
-        owner, mask, _ = view.mask_pairs(view.masks_of(level))
-        order = np.lexsort((chance[owner], mask))
-        sorted_masks = mask[order]
-        starts = np.flatnonzero(np.r_[True, sorted_masks[1:] != sorted_masks[:-1]]) if len(order) else order
-        sizes = np.diff(np.r_[starts, len(order)])
-        last = chance[owner[order[np.minimum(starts + samples, len(order)) - 1]]]
-        limit = np.where((sizes <= samples) | (samples == 0), 1.0, last)
-        np.maximum.at(rates, owner[order], np.repeat(limit, sizes))
+        masks = view.masks_of(level)
+        owner, mask, _ = view.mask_pairs(masks)
+        np.maximum.at(rates, owner, _sample_limits(chance[owner], mask, len(masks), samples)[mask])
     return rates
+
+
+def _sample_limits(
+    chance: NDArray[np.float64], mask: NDArray[np.int64], count: int, samples: int
+) -> NDArray[np.float64]:
+    """Largest priority in the sample of each mask, float64 [count]; 1 where the sample is the whole mask.
+
+    Args:
+        chance: Priority of each pair of a Gaussian and a mask.
+        mask: Mask of each pair.
+        count: Number of masks.
+        samples: Size of a sample; 0 for the whole mask.
+    """
+    sizes = np.bincount(mask, minlength=count)
+    limits = np.ones(count)
+    sampled = (sizes > samples) & (samples > 0)
+    if not sampled.any():
+        return limits
+    # Priorities are uniform, so the wanted one is near samples / size: only pairs below a generous guess are sorted.
+    guess = np.where(sampled, (samples + 8 * samples**0.5) / np.maximum(sizes, 1), -1.0)
+    low = chance <= guess[mask]
+    guess[sampled & (np.bincount(mask[low], minlength=count) < samples)] = 1.0
+    wanted = np.flatnonzero(chance <= guess[mask])
+    order = wanted[np.lexsort((chance[wanted], mask[wanted]))]
+    starts = np.searchsorted(mask[order], np.flatnonzero(sampled))
+    limits[sampled] = chance[order[starts + samples - 1]]
+    return limits
 
 
 def build_graph(
@@ -96,8 +119,8 @@ def build_graph(
 
     rates = sampling_rates(views, level, count, settings.samples_per_mask)
     rows = np.flatnonzero((priorities(count) <= rates) & (rates > 0))
-    row_of = np.full(count, -1)
-    row_of[rows] = np.arange(len(rows))
+    row_of = np.full(count, -1, np.int32)
+    row_of[rows] = np.arange(len(rows), dtype=np.int32)
     scale = 1.0 / np.sqrt(rates[rows])  # a Gaussian kept with probability p stands for 1 / p of its kind
     parts: list[Any] = []  # sparse matrices: as lists of pairs they would take three times the memory
     totals: list[Any] = []
@@ -106,11 +129,10 @@ def build_graph(
         weight_of = view.totals(count)[rows]
         total = np.sqrt(weight_of**3 / (weight_of**2 + settings.pixel_weight**2))
         masks = view.masks_of(level)
-        owner, mask, weight = view.mask_pairs(masks)
-        owner, kept = row_of[owner], row_of[owner] >= 0
-        owner = owner[kept]
-        claim = weight[kept] / weight_of[owner] * total[owner]
-        parts.append(sparse.csc_matrix((claim * scale[owner], (owner, mask[kept])), shape=(len(rows), len(masks))))
+        owner, mask, weight = view.mask_pairs(masks, row_of >= 0)
+        owner = row_of[owner]
+        claim = weight / weight_of[owner] * total[owner] * scale[owner]
+        parts.append(sparse.csc_matrix((claim, (owner, mask)), shape=(len(rows), len(masks))))
         totals.append(sparse.csc_matrix((total * scale)[:, None]))
         view_of += [number] * len(masks)
     claims = sparse.hstack(parts, format="csc")
@@ -130,10 +152,11 @@ def _overlaps(
     own = visible[np.arange(len(view_of)), view_of]
     found: list[tuple[NDArray[Any], ...]] = []
     by_mask = claims.T.tocsr()
-    claims = claims.tocsr()
+    rest = claims.tocsr()
     for start in range(0, len(view_of), BLOCK):
-        block = (by_mask[start : start + BLOCK] @ claims).tocoo()
-        first, second, value = block.row.astype(np.int64) + start, block.col.astype(np.int64), block.data
+        block = (by_mask[start : start + BLOCK] @ rest).tocoo()
+        rest = rest[:, BLOCK:]  # each pair of masks once
+        first, second, value = block.row.astype(np.int64) + start, block.col.astype(np.int64) + start, block.data
         kept = (first < second) & (view_of[first] != view_of[second])
         kept &= value > FAINT * np.minimum(own[first], own[second])
         found.append((first[kept], second[kept], value[kept]))
@@ -143,106 +166,127 @@ def _overlaps(
 
 def join_masks(graph: MaskGraph, settings: InstanceSettings) -> NDArray[np.int64]:
     """Group of every mask, int64 [M]; groups are numbered in the order of their first masks."""
-    from scipy import sparse
-    from scipy.sparse import csgraph
-
-    groups = _Groups.single(graph)
-    of_mask = np.arange(len(graph.view_of))
-    while True:
-        pairs = groups.partners(settings)
-        if not len(pairs):
-            return of_mask
-        count = len(groups.counts)
-        links = sparse.coo_matrix((np.ones(len(pairs)), (pairs[:, 0], pairs[:, 1])), shape=(count, count))
-        _, joined = csgraph.connected_components(links, directed=False)
-        groups = groups.merged(joined.astype(np.int64))
-        of_mask = joined[of_mask]
+    groups = _Groups.single(graph, settings)
+    while len(pairs := groups.partners()):
+        groups.merge(pairs, settings)
+    return np.unique(groups.of_mask, return_inverse=True)[1].astype(np.int64)
 
 
 @dataclass(eq=False)
 class _Groups:
-    """Groups of masks and the pairs of them that may be joined; `likeness` is negative where it is out of date."""
+    """Groups of masks, each in the row of its first mask, and the pairs of them that may be joined.
 
-    first: NDArray[np.int64]
+    A group stays in its row when another joins it, so that a round costs what it changes: the pairs of groups that were
+    joined. Pairs with a view in common are dropped, for what joins them later has that view as well.
+    """
+
+    first: NDArray[np.int64]  # [E]; past the last mask where a pair was dropped, as `second`
     second: NDArray[np.int64]
     shared: NDArray[np.float64]
     strongest: NDArray[np.float64]  # largest share of the smaller mask that two of their masks have in common
-    likeness: NDArray[np.float64]
-    visible: NDArray[np.float64]  # [K, views] sum of V over the masks
-    counts: NDArray[np.int32]  # [K, views] masks in each view
+    likeness: NDArray[np.float64]  # IoU; 0 where they must not be joined
+    of_mask: NDArray[np.int64]  # row of each mask's group [M]
+    visible: NDArray[np.float64]  # [M, views] sum of V over the masks
+    members: NDArray[np.bool_]  # [M, views] whether they have a mask in the view
     features: NDArray[np.float64] | None
+    dropped: int = 0
 
     @classmethod
-    def single(cls, graph: MaskGraph) -> _Groups:
+    def single(cls, graph: MaskGraph, settings: InstanceSettings) -> _Groups:
         """Every mask on its own."""
-        masks = np.arange(len(graph.view_of))
-        counts = np.zeros(graph.visible.shape, np.int32)
-        counts[masks, graph.view_of] = 1
-        own = graph.visible[masks, graph.view_of]
-        share = graph.shared / np.minimum(own[graph.first], own[graph.second])
-        old = np.full(len(graph.first), -1.0)
-        return cls(graph.first, graph.second, graph.shared, share, old, graph.visible, counts, graph.features)
+        first, second, view_of = graph.first.copy(), graph.second.copy(), graph.view_of
+        masks = np.arange(len(view_of))
+        members = np.zeros(graph.visible.shape, bool)
+        members[masks, view_of] = True
+        own = graph.visible[masks, view_of]
+        share = graph.shared / np.minimum(own[first], own[second])
+        features = None if graph.features is None else graph.features.copy()
+        blank = np.zeros(len(first))
+        groups = cls(first, second, graph.shared.copy(), share, blank, masks, graph.visible.copy(), members, features)
+        both = graph.visible[first, view_of[second]] + graph.visible[second, view_of[first]]
+        groups._compare(np.arange(len(first)), both, settings)
+        return groups
 
-    def partners(self, settings: InstanceSettings) -> NDArray[np.int64]:
-        """Pairs of groups that are each other's best partner, [P, 2]."""
-        old = np.flatnonzero(self.likeness < 0)
-        for start in range(0, len(old), PAIRS):
-            self._compare(old[start : start + PAIRS], settings)
+    def partners(self) -> NDArray[np.int64]:
+        """Pairs of groups that are each other's best partner, [P, 2]; of equally good ones the first is the best."""
+        count = len(self.of_mask)
         able = np.flatnonzero(self.likeness > 0)
-        one = np.concatenate([self.first[able], self.second[able]])
-        other = np.concatenate([self.second[able], self.first[able]])
-        order = np.lexsort((other, -np.tile(self.likeness[able], 2), one))
-        one, other = one[order], other[order]
-        best = np.full(len(self.counts), -1)
-        leads = np.r_[True, one[1:] != one[:-1]] if len(one) else np.zeros(0, bool)
-        best[one[leads]] = other[leads]
-        group = np.flatnonzero(best >= 0)
+        first, second, likeness = self.first[able], self.second[able], self.likeness[able]
+        top = np.zeros(count)
+        np.maximum.at(top, first, likeness)
+        np.maximum.at(top, second, likeness)
+        best = np.full(count, count)
+        for one, other in ((first, second), (second, first)):
+            wins = likeness == top[one]
+            np.minimum.at(best, one[wins], other[wins])
+        group = np.flatnonzero(best < count)
         mutual = group[(best[best[group]] == group) & (group < best[group])]
         return np.stack([mutual, best[mutual]], axis=1)
 
-    def _compare(self, pairs: NDArray[np.int64], settings: InstanceSettings) -> None:
-        """IoU of some pairs; 0 where they must not be joined."""
+    def merge(self, pairs: NDArray[np.int64], settings: InstanceSettings) -> None:
+        """Join pairs of groups; no group is in two of the pairs."""
+        into, gone = pairs.T
+        self.visible[into] += self.visible[gone]
+        self.members[into] |= self.members[gone]
+        if self.features is not None:
+            self.features[into] += self.features[gone]
+        count = len(self.of_mask)
+        row = np.arange(count + 1)
+        row[gone] = into
+        self.of_mask = row[self.of_mask]
+        changed = np.zeros(count + 1, bool)
+        changed[pairs] = True
+        touched = np.flatnonzero(changed[self.first] | changed[self.second])
+        one, other = row[self.first[touched]], row[self.second[touched]]
+        places = self._unite(touched, np.minimum(one, other), np.maximum(one, other))
+        for start in range(0, len(places), PAIRS):
+            part = places[start : start + PAIRS]
+            part = part[self.strongest[part] >= settings.least_shared]  # before the costly sums
+            one, other = self.first[part], self.second[part]
+            both = np.einsum("ij,ij->i", self.visible[one], self.members[other])
+            both += np.einsum("ij,ij->i", self.visible[other], self.members[one])
+            self._compare(part, both, settings)
+
+    def _unite(
+        self, touched: NDArray[np.int64], first: NDArray[np.int64], second: NDArray[np.int64]
+    ) -> NDArray[np.int64]:
+        """Give pairs their new groups, and add up those that became one pair; gives the places of what is left."""
+        count = len(self.of_mask)
+        apart = np.flatnonzero(first != second)
+        apart = apart[~(self.members[first[apart]] & self.members[second[apart]]).any(axis=1)]
+        keys = first[apart] * count + second[apart]
+        order = np.argsort(keys, kind="stable")
+        keys, source = keys[order], touched[apart[order]]
+        starts = np.flatnonzero(np.diff(keys, prepend=-1))
+        places, free = touched[: len(starts)], touched[len(starts) :]
+        if len(starts):
+            shared, strongest = self.shared[source], self.strongest[source]
+            self.shared[places] = np.add.reduceat(shared, starts)
+            self.strongest[places] = np.maximum.reduceat(strongest, starts)
+        self.first[places], self.second[places] = np.divmod(keys[starts], count)
+        self.first[free] = self.second[free] = count
+        self.likeness[touched] = 0.0
+        self.dropped += len(free)
+        return places if self.dropped < SPARE * len(self.first) else self._compact(places)
+
+    def _compact(self, places: NDArray[np.int64]) -> NDArray[np.int64]:
+        """Forget the pairs that were dropped; gives where the pairs at some places went."""
+        alive = self.first < len(self.of_mask)
+        for name in ("first", "second", "shared", "strongest", "likeness"):
+            setattr(self, name, getattr(self, name)[alive])
+        self.dropped = 0
+        moved: NDArray[np.int64] = (np.cumsum(alive) - 1)[places]
+        return moved
+
+    def _compare(self, pairs: NDArray[np.int64], both: NDArray[np.float64], settings: InstanceSettings) -> None:
+        """Set the likeness of some pairs; `both` is V of each in the views of the other, added up."""
         one, other, shared = self.first[pairs], self.second[pairs], self.shared[pairs]
-        both = np.einsum("ij,ij->i", self.visible[one], self.counts[other])
-        both += np.einsum("ij,ij->i", self.visible[other], self.counts[one])
         iou = shared / np.maximum(both - shared, 1e-300)
         fine = (iou >= settings.least_iou) & (self.strongest[pairs] >= settings.least_shared)
-        fine &= ~((self.counts[one] > 0) & (self.counts[other] > 0)).any(axis=1)
         if self.features is not None and settings.least_cosine is not None:
             unit = self.features / np.maximum(np.linalg.norm(self.features, axis=1, keepdims=True), 1e-300)
-            fine &= np.einsum("ij,ij->i", unit[one], unit[other]) >= settings.least_cosine
+            fine[fine] = np.einsum("ij,ij->i", unit[one[fine]], unit[other[fine]]) >= settings.least_cosine
         self.likeness[pairs] = np.where(fine, iou, 0.0)
-
-    def merged(self, joined: NDArray[np.int64]) -> _Groups:
-        """The groups after joining; `joined` says in which of the new ones each of the old is."""
-        count = int(joined.max()) + 1
-        changed = np.bincount(joined, minlength=count) > 1
-        first, second = joined[self.first], joined[self.second]
-        first, second = np.minimum(first, second), np.maximum(first, second)
-        keys, place = np.unique(first * count + second, return_inverse=True)
-        shared = np.bincount(place, weights=self.shared, minlength=len(keys))
-        strongest, likeness = np.zeros(len(keys)), np.zeros(len(keys))
-        np.maximum.at(strongest, place, self.strongest)
-        likeness[place] = self.likeness  # a pair of unchanged groups stands for itself alone
-        first, second = keys // count, keys % count
-        likeness[changed[first] | changed[second]] = -1.0
-        apart = first != second
-        return _Groups(
-            first=first[apart],
-            second=second[apart],
-            shared=shared[apart],
-            strongest=strongest[apart],
-            likeness=likeness[apart],
-            visible=_sum_rows(self.visible, joined, count),
-            counts=_sum_rows(self.counts, joined, count),
-            features=None if self.features is None else _sum_rows(self.features, joined, count),
-        )
-
-
-def _sum_rows(values: NDArray[Any], joined: NDArray[np.int64], count: int) -> NDArray[Any]:
-    total = np.zeros((count, *values.shape[1:]), values.dtype)
-    np.add.at(total, joined, values)
-    return total
 
 
 def name_groups(views: Sequence[ViewEvidence], level: str) -> tuple[NDArray[np.int64], tuple[str, ...]]:

@@ -59,13 +59,25 @@ class ViewEvidence:
         """Weight of each Gaussian in this view, float64 [N]."""
         return np.bincount(self.gaussians, weights=self.weights, minlength=count).astype(np.float64)
 
-    def mask_pairs(self, masks: NDArray[np.int64]) -> tuple[NDArray[np.int32], NDArray[np.int64], NDArray[np.float32]]:
-        """Gaussian, place in `masks` and weight of the pairs of a Gaussian and a mask, once per set that they share."""
+    def mask_pairs(
+        self, masks: NDArray[np.int64], wanted: NDArray[np.bool_] | None = None
+    ) -> tuple[NDArray[np.int32], NDArray[np.int64], NDArray[np.float32]]:
+        """Gaussian, place in `masks` and weight of the pairs of a Gaussian and a mask, once per set that they share.
+
+        Args:
+            masks: Masks to look at.
+            wanted: Gaussians to look at, bool [N]; None for all.
+        """
         members = self.members[:, masks]
         counts = members.sum(axis=1)
         firsts = np.cumsum(counts) - counts
         places = np.nonzero(members)[1]
         repeats = counts[self.sets]
+        if wanted is not None:
+            repeats[~wanted[self.gaussians]] = 0
+        if counts.max(initial=0) <= 1:  # masks that do not overlap
+            pair = np.flatnonzero(repeats)
+            return self.gaussians[pair], places[firsts[self.sets[pair]]], self.weights[pair]
         pair = np.repeat(np.arange(len(self.sets)), repeats)
         within = np.arange(len(pair)) - np.repeat(np.cumsum(repeats) - repeats, repeats)
         return self.gaussians[pair], places[firsts[self.sets[pair]] + within], self.weights[pair]

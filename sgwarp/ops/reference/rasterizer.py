@@ -248,12 +248,13 @@ def blend_blocks(projection: Projection, width: int, height: int, settings: Refe
             bottom, right = min(top + BLOCK, height), min(left + BLOCK, width)
             reaches = (high[:, 0] >= left) & (low[:, 0] <= right) & (high[:, 1] >= top) & (low[:, 1] <= bottom)
             y, x = torch.meshgrid(torch.arange(top, bottom), torch.arange(left, right), indexing="ij")
-            yield _blend(projection, reaches.nonzero()[:, 0], x.flatten(), y.flatten(), width, settings)
+            yield blend_pixels(projection, reaches.nonzero()[:, 0], x.flatten(), y.flatten(), width, settings)
 
 
-def _blend(
+def blend_pixels(
     projection: Projection, rows: Tensor, x: Tensor, y: Tensor, width: int, settings: ReferenceSettings
 ) -> Blend:
+    """Composite pixels (x, y), int64 [P], against some rows of a projection, ascending."""
     mean2d, opacity, depth = projection.mean2d[rows], projection.opacity[rows], projection.depth[rows]
     a, b, c = projection.conic[rows].unbind(1)
     dx = x[:, None] + 0.5 - mean2d[:, 0]

@@ -1,0 +1,71 @@
+"""`sgwarp instances` from the files that other tools write: ids of a video tracker, stacks of masks at levels."""
+
+import json
+
+import cv2
+import numpy as np
+import pytest
+
+from sgwarp.cli import main
+from sgwarp.io.instances import load_instances
+
+
+def find(stage_files, folder, masks: str, *options: str):
+    out = folder / "found" / "i.safetensors"
+    arguments = [str(stage_files.scene), "--views", str(stage_files.views), "--masks", masks, "--out", str(out)]
+    assert main(["instances", *arguments, *options]) == 0
+    return load_instances(out), json.loads((out.parent / "table.json").read_text())["instances"]
+
+
+def of_panel(stage, found, level=None) -> list[int]:
+    """The instance that most decided Gaussians of each panel belong to, 0 for nothing."""
+    ids = found.instance(level)
+    return [int(ids[(stage.classes == panel) & (ids >= 0)].bincount().argmax()) for panel in range(1, 5)]
+
+
+def write_deva(stage, folder, ids_of) -> None:
+    (folder / "Annotations").mkdir(parents=True)
+    frames = []
+    for number, view in enumerate(stage.views):
+        shown = np.append(0, ids_of(number))[stage.labels(view).numpy()]
+        colors = np.stack([shown >> 16, shown >> 8 & 255, shown & 255], -1).astype(np.uint8)
+        cv2.imwrite(str(folder / "Annotations" / f"{view.stem}.png"), colors)
+        segments = [{"id": int(k), "category_id": 1, "score": 1.0} for k in np.unique(shown) if k]
+        frames.append({"file_name": f"{view.stem}.jpg", "segments_info": segments})
+    (folder / "pred.json").write_text(json.dumps({"annotations": frames}))
+
+
+def test_ids_of_a_tracker_are_joined_whether_they_last_or_not(stage, stage_files, tmp_path):
+    """The same ids in all frames are trusted by name; drawn anew in every frame they still give the four panels."""
+    lasting = np.array([513, 70000, 7, 300])
+    write_deva(stage, tmp_path / "lasting", lambda number: lasting)
+    found, rows = find(stage_files, tmp_path, f"deva:{tmp_path / 'lasting'}", "--group", "name")
+    assert [rows[number - 1]["label"] for number in of_panel(stage, found)] == ["513", "70000", "7", "300"]
+    random = np.random.default_rng(5)
+    drawn = [random.choice(100_000, 4, replace=False) + 1 for _ in stage.views]
+    write_deva(stage, tmp_path / "shuffled", lambda number: drawn[number])
+    found, rows = find(stage_files, tmp_path, f"deva:{tmp_path / 'shuffled'}")
+    assert sorted(of_panel(stage, found)) == [1, 2, 3, 4]
+    assert len(rows) == 4
+    assert {row["views"] for row in rows} == {6}
+
+
+@pytest.mark.parametrize("levels", ["s,l", "l"])
+def test_stacks_of_masks_at_levels_give_a_tree(stage, stage_files, tmp_path, levels):
+    """Door and lamp together are a large mask, wall and book another; door and lamp alone are small ones."""
+    folder = tmp_path / "masks"
+    folder.mkdir()
+    for number, view in enumerate(stage.views):
+        labels = stage.labels(view).numpy()
+        masks = np.stack([labels == 2, labels == 3, (labels == 2) | (labels == 3), (labels == 1) | (labels == 4)])
+        ranks = np.array([0, 0, 2, 2])
+        order = np.random.default_rng(number).permutation(4)
+        np.savez(folder / f"{view.stem}.npz", masks=masks[order], ranks=ranks[order], scores=np.ones(4))
+    found, rows = find(stage_files, tmp_path, f"masks:{folder}", "--levels", levels)
+    wall, door, lamp, book = of_panel(stage, found, "l")
+    assert door == lamp != wall == book
+    assert found.levels == tuple(levels.split(","))
+    if levels == "s,l":
+        small_wall, small_door, small_lamp, _ = of_panel(stage, found, "s")
+        assert 0 == small_wall != small_door != small_lamp != 0
+        assert [rows[number - 1]["parent"] for number in (small_door, small_lamp)] == [door, door]
