@@ -129,9 +129,21 @@ class InstanceMap:
         Raises:
             InputError: There is no such id.
         """
+        return self.instance(self.table[self._row(instance)].level) == instance
+
+    def leaning(self, instance: int) -> Tensor:
+        """Gaussians whose first candidate an instance is, decided or not, bool [N].
+
+        Raises:
+            InputError: There is no such id.
+        """
+        level = self.table[self._row(instance)].level
+        return self.candidates[self.level_index(level), :, 0] == instance
+
+    def _row(self, instance: int) -> int:
         if not 1 <= instance <= len(self.table):
             raise InputError(f"instance {instance}: unknown id; this scene has 1 to {len(self.table)}")
-        return self.instance(self.table[instance - 1].level) == instance
+        return instance - 1
 
     def require_scene(self, gaussians: Gaussians) -> None:
         """Raise InputError if these instances belong to another scene."""

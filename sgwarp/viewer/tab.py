@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 
 from sgwarp.apps.editing.operations import Operation
-from sgwarp.apps.editing.picker import grow
+from sgwarp.apps.editing.picker import grow, whole_instance
 from sgwarp.errors import InputError
 from sgwarp.querying.scoring import TextScores
 from sgwarp.scene import Camera
@@ -245,7 +245,7 @@ class Tab:
             raise InputError("object: needs --instances, what `sgwarp instances` wrote")
         number = bounds.whole("object", number, 1, len(instances.table))
         scene = self.bench.scene(self.look.moment)
-        chosen = instances.members(number)[scene.rows]
+        chosen = whole_instance(scene.state, instances, number)
         level = instances.table[number - 1].level
         return self._select(clicks.describe(scene.state, self.bench.asker, instances, chosen, level), scene)
 

@@ -13,6 +13,7 @@ from sgwarp.apps.editing.picker import EditContext, _name_instances, grow, large
 from sgwarp.apps.editing.script import EditStep, load_script, save_script, step_from
 from sgwarp.apps.editing.selection import Selection, parse_term
 from sgwarp.apps.editing.session import HISTORY, EditSession, edit
+from sgwarp.apps.instances.maps import render_ids
 from sgwarp.errors import InputError
 from sgwarp.ops.planar.harmonics_rotation import rotate_harmonics, rotation_of_harmonics
 from sgwarp.ops.reference.rasterizer import harmonics, rasterize, rotation_matrices
@@ -295,10 +296,33 @@ def test_a_text_names_all_instances_that_come_close_to_the_best(stage, context):
     """Means of 3, 2.5, 1 and -1: those from 80 % of the best on are named, and none that a rival fits better."""
     scores = torch.tensor([3.0, 2.5, 1.0, -1.0])[stage.classes - 1]
     seen, nothing = torch.ones(len(scores), dtype=torch.bool), torch.full_like(scores, -torch.inf)
-    assert torch.equal(_name_instances(scores, nothing, seen, context.instances), stage.classes <= 2)
+    assert torch.equal(_name_instances(scores, nothing, seen, context.instances)[0], stage.classes <= 2)
     rivals = torch.where(stage.classes == 1, 4.0, 0.0)
-    assert torch.equal(_name_instances(scores, rivals, seen, context.instances), stage.classes == 2)
-    assert not bool(_name_instances(-scores.abs(), nothing, seen, context.instances).any())
+    assert torch.equal(_name_instances(scores, rivals, seen, context.instances)[0], stage.classes == 2)
+    assert not bool(torch.stack(_name_instances(-scores.abs(), nothing, seen, context.instances)).any())
+
+
+@pytest.mark.parametrize("term", ["id:3", "text:lamp", "click"])
+def test_undecided_parts_move_with_their_instance(stage, context, term):
+    """A third of the lamp was hardly seen, and leans towards it; so does a far part of the wall, which stays."""
+    lamp = (stage.classes == 3).nonzero().flatten()
+    far = (stage.classes == 1).nonzero().flatten()
+    distance = torch.cdist(stage.gaussians.means[far], stage.gaussians.means[lamp]).amin(dim=1)
+    far = far[distance.argmax()]
+    candidates, observations = context.instances.candidates.clone(), context.instances.observations.clone()
+    hardly = lamp[torch.arange(len(lamp)) % 3 == 1]
+    observations[hardly] = 0.05
+    observations[far], candidates[0, far, 0] = 0.05, 3
+    found = dataclasses.replace(context.instances, candidates=candidates, observations=observations)
+    assert not bool(found.members(3)[hardly].any())
+    assert bool(found.leaning(3)[far])
+    if term == "click":
+        view = context.views[0]
+        ids, _ = render_ids(stage.gaussians, found, view.camera)
+        y, x = (ids == 3).nonzero()[0].tolist()
+        term = f"click:{view.stem},{x},{y}"
+    wanted = dataclasses.replace(context, instances=found)
+    assert torch.equal(picked(stage, wanted, term), stage.classes == 3)
 
 
 def test_without_semantics_a_text_is_a_label(stage, context):

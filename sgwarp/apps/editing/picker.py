@@ -96,10 +96,9 @@ def _advice(selection: Selection) -> str:
 def _pick_clean(state: EditState, term: Term, selection: Selection, context: EditContext, free: Tensor) -> Tensor:
     """What a term selects among some Gaussians, without its scattered pieces, bool [N]."""
     means, around = state.gaussians.means, None
-    if term.kind == "text":
-        chosen, around = score_text(term.text, selection, context)
-        chosen = chosen.to(state.rows.device)[state.rows]
-        around = None if around is None else around.to(state.rows.device)[state.rows]
+    if term.kind in ("text", "id"):
+        by = score_text(term.text, selection, context) if term.kind == "text" else _pick_id(term, context)
+        chosen, around = (part.to(state.rows.device)[state.rows] for part in by)
     else:
         chosen = _pick_term(state, term, context)
     chosen = chosen & free
@@ -109,7 +108,7 @@ def _pick_clean(state: EditState, term: Term, selection: Selection, context: Edi
 
 
 def _pick_term(state: EditState, term: Term, context: EditContext) -> Tensor:
-    """What a term that is no text selects, bool [N]."""
+    """What a term selects that is neither a text nor an id, bool [N]."""
     gaussians = state.gaussians
     if term.kind == "all":
         return torch.ones(len(gaussians), dtype=torch.bool, device=gaussians.device)
@@ -126,14 +125,18 @@ def _pick_term(state: EditState, term: Term, context: EditContext) -> Tensor:
         return ((means >= corners[:3]) & (means <= corners[3:])).all(dim=1)
     if term.kind == "rows":
         return _pick_rows(state, term)
-    if term.kind == "click":
-        return _pick_click(state, term, context)
+    return _pick_click(state, term, context)
+
+
+def _pick_id(term: Term, context: EditContext) -> tuple[Tensor, Tensor]:
+    """Members of an instance, and what leans towards it, bool [N] of the scene as loaded."""
     if context.instances is None:
         raise InputError(f"select id:{term.numbers[0]:g}: needs --instances, what `sgwarp instances` wrote")
-    return context.instances.members(int(term.numbers[0])).to(state.rows.device)[state.rows]
+    number = int(term.numbers[0])
+    return context.instances.members(number), context.instances.leaning(number)
 
 
-def score_text(text: str, selection: Selection, context: EditContext) -> tuple[Tensor, Tensor | None]:
+def score_text(text: str, selection: Selection, context: EditContext) -> tuple[Tensor, Tensor]:
     """Gaussians of the scene as loaded that a text names.
 
     Where instances are known a text names whole ones: that with the best mean score, and those that come close to it.
@@ -141,18 +144,18 @@ def score_text(text: str, selection: Selection, context: EditContext) -> tuple[T
     Returns:
         chosen: Those that score more than the threshold, bool [N].
         around: Those that belong to it where they are connected with it, bool [N]: they score more than half the
-            threshold; None if the first is all.
+            threshold, or are undecided and lean towards the instance.
     """
     semantics = context.semantics
     if semantics is None:
         named = _named(text, context.instances)
         if named is not None:
-            return named, None
+            return named
         raise InputError(f"select '{text}': needs --semantics, what `sgwarp lift` wrote for this scene")
     asked = [text, *selection.negatives]
     if semantics.labels is not None:
-        scores, least, low = class_votes(semantics, asked), selection.threshold, None
-        high = scores[:, 0] > least
+        scores, least = class_votes(semantics, asked), selection.threshold
+        high = low = scores[:, 0] > least
     else:
         if context.encoder is None:
             raise InputError(f"select '{text}': needs the text encoder of space '{semantics.space}'")
@@ -168,9 +171,9 @@ def score_text(text: str, selection: Selection, context: EditContext) -> tuple[T
         low = stands_out & (answers.values[:, 0] > HALF * selection.threshold)
     rivals = scores[:, 1:].max(dim=1).values if selection.negatives else torch.full_like(scores[:, 0], -torch.inf)
     if context.instances is not None:
-        return _name_instances(scores[:, 0], rivals, semantics.seen, context.instances, least), None
+        return _name_instances(scores[:, 0], rivals, semantics.seen, context.instances, least)
     fits = scores[:, 0] > rivals
-    return high & fits, None if low is None else low & fits
+    return high & fits, low & fits
 
 
 def _require_evidence(text: str, best: float, level: float) -> None:
@@ -180,16 +183,22 @@ def _require_evidence(text: str, best: float, level: float) -> None:
         raise InputError(f"select '{text}': {found}; select it by click:, id: or box:, or give --instances")
 
 
-def _named(text: str, instances: InstanceMap | None) -> Tensor | None:
-    """Members of the instances with a label; None if there is none."""
+def _named(text: str, instances: InstanceMap | None) -> tuple[Tensor, Tensor] | None:
+    """Members of the instances with a label, and what leans towards them; None if there is none."""
     found = [row for row in instances.table if row.label == text] if instances is not None else []
     if instances is None or not found:
         return None
-    return torch.stack([instances.members(row.id) for row in found]).any(dim=0)
+    members, leaning = ([of(row.id) for row in found] for of in (instances.members, instances.leaning))
+    return torch.stack(members).any(dim=0), torch.stack(leaning).any(dim=0)
 
 
-def _name_instances(scores: Tensor, rivals: Tensor, seen: Tensor, instances: InstanceMap, least: float = 0.0) -> Tensor:
-    """Members of the instances whose Gaussians score best on the mean, bool [N]; none that score `least` or less."""
+def _name_instances(
+    scores: Tensor, rivals: Tensor, seen: Tensor, instances: InstanceMap, least: float = 0.0
+) -> tuple[Tensor, Tensor]:
+    """Members of the instances whose Gaussians score best on the mean, and what leans towards them, bool [N] each.
+
+    None that score `least` or less.
+    """
     ids = instances.instance().to(scores.device).clamp(min=0)
     ids = torch.where(seen.to(scores.device), ids, 0)
     count = len(instances.table) + 1
@@ -200,8 +209,8 @@ def _name_instances(scores: Tensor, rivals: Tensor, seen: Tensor, instances: Ins
     able[0] = False
     best = mean[able].max() if bool(able.any()) else torch.inf
     chosen = able & (mean >= SAME * best)
-    members = instances.instance().to(scores.device)
-    return chosen[members.clamp(min=0)] & (members > 0)
+    leaning = chosen[instances.candidates[instances.level_index(), :, 0].to(scores.device).long().clamp(min=0)]
+    return leaning & (instances.instance().to(scores.device) > 0), leaning
 
 
 def _pick_click(state: EditState, term: Term, context: EditContext) -> Tensor:
@@ -241,11 +250,23 @@ def pick_at(
         ids = context.instances.instance(level).to(state.rows.device)[state.rows]
         votes = torch.bincount(ids[found].clamp(min=0), weights=weights.double())
         votes[0] = 0.0
-        same_copy = state.copies == state.copies[found[0]]
-        return (ids == votes.argmax()) & (votes.max() > 0) & same_copy
+        if not bool(votes.max() > 0):
+            return nothing
+        return whole_instance(state, context.instances, int(votes.argmax())) & (state.copies == state.copies[found[0]])
     if context.semantics is None:
         raise InputError("a click needs instances, or semantics for what looks alike")
     return _looks_alike(state, context.semantics, found, weights)
+
+
+def whole_instance(state: EditState, instances: InstanceMap, number: int) -> Tensor:
+    """Members of an instance, and what is connected with them, undecided and leans towards it, bool [N].
+
+    Raises:
+        InputError: There is no such id.
+    """
+    parts = (instances.members(number), instances.leaning(number))
+    members, leaning = (part.to(state.rows.device)[state.rows] for part in parts)
+    return spread(state.gaussians.means, members, leaning)
 
 
 def contributors_at(gaussians: Gaussians, camera: Camera, pixel: tuple[int, int]) -> tuple[Tensor, Tensor]:
