@@ -32,7 +32,8 @@ class Distill(Options):
     """
 
     scenes: tyro.conf.Positional[list[Path]]
-    """Scenes {name}.ply with {name}.safetensors beside each, which `sgwarp lift` wrote; or folders of them."""
+    """Scenes {name}.ply with {name}.safetensors beside each, which `sgwarp lift` wrote; folders of them; or the folder
+    of results of `sgwarp batch`, whose lifted scenes are taken."""
 
     out: Path
     """Network to write, .safetensors; its curves and run.json go beside it."""
@@ -64,7 +65,7 @@ class Distill(Options):
 
     loss: Literal["cosine", "contrastive"] = "cosine"
     """cosine: features of voxels against lifted ones, as in the paper; contrastive: rendered features against masks of
-    the views, which lie in the folder {name}/ beside {name}.ply."""
+    the views, which lie in the folder {name}/ beside {name}.ply, or where a batch found them."""
 
     encoder: str = "conse"
     """Encoder of the masks for the contrastive loss, the one that the scenes were lifted with; {views} stands for a
@@ -149,14 +150,13 @@ class Distill(Options):
             seed=self.seed,
         )
 
-    def _masks_of(self, scene: Path) -> list[LoadMasks]:
-        """What loads the masks of each view beside a scene, in the order of the views."""
+    def _masks_of(self, folder: Path) -> list[LoadMasks]:
+        """What loads the masks of each view in a folder, in the order of the views."""
         from sgwarp.encoders.cache import default_folder
         from sgwarp.encoders.registry import make_encoder
         from sgwarp.io.views import load_views
         from sgwarp.network.training.contrastive import MaskedView
 
-        folder = scene.with_name(scene.name.removesuffix(".ply").removesuffix(".compressed"))
         views = load_views(folder)
         source = make_encoder(self.encoder.replace("{views}", str(folder)), views, self.device, default_folder())
         has_map = getattr(source, "has_map", lambda view: True)
