@@ -15,6 +15,7 @@ import hashlib
 import json
 import os
 import random
+import secrets
 import signal
 import subprocess
 import sys
@@ -28,7 +29,7 @@ from pathlib import Path
 sys.path.insert(0, str(Path(__file__).parent))
 
 from resuming import RUN, write_scenes
-from two_hosts import HEAD, PORT, Hosts, ray_cluster, refusal, two_hosts
+from two_hosts import HEAD, PORT, ray_cluster, refusal, two_hosts
 
 ENVIRONMENT = {"OMP_NUM_THREADS": "1"}
 WORKER = (b"sgwarp.cluster.worker", b"ray::_remote_work")
@@ -41,15 +42,14 @@ class Place:
     """Where drivers and workers run."""
 
     engine: str
-    hosts: Hosts | None = None
     roots: list[int] = field(default_factory=list)  # processes whose descendants may be workers, beside the driver's
 
     def start(self, data: Path, out: Path, *extra: str) -> subprocess.Popen[bytes]:
         words = ["batch", str(data), "--do", "lift,segment", "--out", str(out), "--workers", "2", "--threads", "1"]
         words += ["--engine", self.engine, *extra, "--options", "lift.encoder=files:{path}/labels"]
         command = [sys.executable, "-c", RUN, *words]
-        if self.hosts is not None:
-            command = self.hosts.command(self.hosts.head, command)
+        if self.engine == "ray" and self.roots:  # on the head's host, with its /tmp/ray
+            command = ["nsenter", "--target", str(self.roots[0]), "--mount", "--net", *command]
         quiet = {"stdout": subprocess.DEVNULL, "stderr": subprocess.PIPE}
         return subprocess.Popen(command, env={**os.environ, **ENVIRONMENT}, **quiet)
 
@@ -64,8 +64,9 @@ def place(engine: str) -> Iterator[tuple[Place, tuple[str, ...]]]:
     if engine != "hosts":
         yield Place(engine), ()
         return
+    ENVIRONMENT.update(RAY_AUTH_MODE="token", RAY_AUTH_TOKEN=secrets.token_hex(32))
     with two_hosts() as hosts, ray_cluster(hosts, 2, ENVIRONMENT) as roots:
-        yield Place("ray", hosts, roots), ("--address", f"{HEAD}:{PORT}")
+        yield Place("ray", roots), ("--address", f"{HEAD}:{PORT}")
 
 
 def descendants(roots: Sequence[int]) -> set[int]:

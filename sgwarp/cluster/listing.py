@@ -102,8 +102,9 @@ def _same_place(path: Path, out: Path | None) -> bool:
 
 
 def _csv_rows(path: Path) -> Iterator[tuple[str, Path, dict[str, str]]]:
-    lines = [line if not line.startswith("#") else "" for line in _read(path).splitlines()]  # numbers stay
-    rows = csv.DictReader(lines)
+    lines = ["" if line.startswith("#") else line for line in _read(path).splitlines()]
+    before = next((number for number, line in enumerate(lines) if line), 0)  # lines before the names of the columns
+    rows = csv.DictReader(lines[before:])
     heads = [head.strip() for head in rows.fieldnames or ()]
     if "path" not in heads:
         raise InputError(f"{path}: has no column 'path'; its first line names the columns: path,name,fit.steps,...")
@@ -111,12 +112,14 @@ def _csv_rows(path: Path) -> Iterator[tuple[str, Path, dict[str, str]]]:
         raise InputError(f"{path}: column '{twice}' stands there twice; leave one")
     for row in rows:
         if None in row:
-            raise InputError(f"{path}: line {rows.line_num} has more cells than there are columns; quote commas")
+            raise InputError(
+                f"{path}: line {before + rows.line_num} has more cells than there are columns; quote commas"
+            )
         cells = {head: (value or "").strip() for head, value in zip(heads, row.values(), strict=True)}
         if not any(cells.values()):
             continue
         if not cells["path"]:
-            raise InputError(f"{path}: line {rows.line_num} has no path")
+            raise InputError(f"{path}: line {before + rows.line_num} has no path")
         place = path.parent / cells.pop("path")
         yield cells.pop("name", "") or _name(place), place, {key: value for key, value in cells.items() if value}
 

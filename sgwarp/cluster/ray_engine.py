@@ -74,7 +74,10 @@ class RayEngine:
             ray.init(address=self.address or "local", **settings)
         except (ConnectionError, OSError, RuntimeError, ValueError) as error:
             line = (str(error).strip().splitlines() or ["no answer"])[0]
-            raise InputError(f"--address {self.address or 'of this machine'}: Ray cannot be started ({line})") from None
+            if self.address is None:
+                raise InputError(f"--engine ray: Ray cannot be started on this machine ({line})") from None
+            remedy = "check the address, and whether the cluster asks for a token (RAY_AUTH_MODE, RAY_AUTH_TOKEN_PATH)"
+            raise InputError(f"--address {self.address}: Ray does not answer ({line}); {remedy}") from None
 
     def _run(self, ray: Any, tasks: Iterator[Task]) -> Iterator[Outcome]:
         remote = ray.remote(_remote_work).options(num_cpus=self.cores, num_gpus=self.gpus, max_retries=TRIES - 1)

@@ -99,12 +99,15 @@ class Distill(Options):
 
         log = self.start()
         with joined(self.device) as processes:
+            from sgwarp.encoders.registry import keep_encoders
             from sgwarp.network.semantic_network import save_network
             from sgwarp.network.training.curves import write_curves
             from sgwarp.network.training.data import scenes_in
             from sgwarp.network.training.trainer import distill, state_path
 
             masks = self._masks_of if self.loss == "contrastive" else None
+            if masks is not None:
+                keep_encoders()  # one network for the masks of all scenes
             scenes, validation = scenes_in(self.scenes, masks), scenes_in(self.validation or [])
             settings = self._settings()
             with show_progress("distill") as progress:

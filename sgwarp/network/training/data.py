@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from functools import cache, partial
+from functools import lru_cache, partial
 from pathlib import Path
 
 import torch
@@ -19,6 +19,7 @@ from sgwarp.network.training.contrastive import MaskedView
 from sgwarp.scene import Gaussians, Semantics
 
 CHUNK = 65536  # Gaussians whose features are widened at once
+KEPT = 4  # scenes whose views and sources of masks stay: those of a step, not those of a data set
 LoadMasks = Callable[[], MaskedView]
 MasksOf = Callable[[Path], list[LoadMasks]]
 
@@ -55,7 +56,8 @@ def scenes_in(paths: Sequence[Path], masks: MasksOf | None = None) -> list[Train
         found += inside
     if paths and not found:
         raise InputError(f"{paths[0]}: no scene of this batch is done; see why in its summary.csv")
-    return [_scene(lifted, masks) for lifted in found]
+    few = None if masks is None else lru_cache(KEPT)(masks)
+    return [_scene(lifted, few) for lifted in found]
 
 
 def _beside(path: Path) -> Lifted:
@@ -79,7 +81,7 @@ def _scene(lifted: Lifted, masks: MasksOf | None) -> TrainingScene:
 
     files = (path, semantics)
     stamp = " ".join(f"{file.stat().st_size}:{file.stat().st_mtime_ns}" for file in files)
-    return TrainingScene(str(path), load, stamp, files, None if masks is None else cache(partial(masks, lifted.views)))
+    return TrainingScene(str(path), load, stamp, files, None if masks is None else partial(masks, lifted.views))
 
 
 @dataclass(frozen=True, eq=False)
