@@ -2,10 +2,10 @@
 
     python -m benchmarks.batch_faults [--engine local|ray|hosts] [--scenes 200] [--seed 0] [--out FILE.json]
 
-Tiny generated rooms are lifted and segmented by the command itself, by two workers. First undisturbed; then into
-another folder, while SIGKILL ends a worker or the driver a random time after a scene has been done, until a driver ends
-by itself. `hosts` is Ray on two hosts: two network namespaces of this machine, the head and the driver in one, the
-workers in the other; it needs root.
+Tiny generated rooms are lifted and segmented by the command itself, by two workers. First undisturbed, by the local
+engine; then into another folder, while SIGKILL ends a worker or the driver a random time after a scene has been done,
+until a driver ends by itself. `hosts` is Ray on two hosts: two network namespaces of this machine, the head and the
+driver in one, the workers in the other; it needs root.
 """
 
 from __future__ import annotations
@@ -157,7 +157,7 @@ def run(options: argparse.Namespace) -> dict[str, object]:
     with tempfile.TemporaryDirectory() as folder, place(options.engine) as (where, extra):
         data, whole, out = (Path(folder) / name for name in ("data", "undisturbed", "out"))
         write_scenes(data, options.scenes)
-        first = where.start(data, whole, *extra)
+        first = Place("local").start(data, whole)
         said = first.communicate()[1].decode(errors="replace")
         if first.returncode:
             raise SystemExit(f"the undisturbed run ended with {first.returncode}: {said[-2000:]}")
