@@ -102,7 +102,8 @@ def results(out: Path) -> dict[str, str]:
 
 def done(out: Path) -> dict[str, tuple[int, int]]:
     """Inode and time of each scene's record."""
-    return {path.parent.name: (path.stat().st_ino, path.stat().st_mtime_ns) for path in out.glob("*/done.json")}
+    paths = out.glob("[!.]*/done.json")  # a folder at work gets its record before its name
+    return {path.parent.name: (path.stat().st_ino, path.stat().st_mtime_ns) for path in paths}
 
 
 @dataclass

@@ -112,9 +112,8 @@ def _csv_rows(path: Path) -> Iterator[tuple[str, Path, dict[str, str]]]:
         raise InputError(f"{path}: column '{twice}' stands there twice; leave one")
     for row in rows:
         if None in row:
-            raise InputError(
-                f"{path}: line {before + rows.line_num} has more cells than there are columns; quote commas"
-            )
+            line = before + rows.line_num
+            raise InputError(f"{path}: line {line} has more cells than there are columns; quote commas")
         cells = {head: (value or "").strip() for head, value in zip(heads, row.values(), strict=True)}
         if not any(cells.values()):
             continue

@@ -96,6 +96,7 @@ class Batch:
         chosen = shard_of(scenes, self.shard) if self.shard is not None else scenes
         tasks = self._tasks(chosen)
         check_apart(tasks, self.out, {scene.name for scene in scenes})
+        self.out.mkdir(parents=True, exist_ok=True)  # a system that refuses it does so before the work
         log = RunLog(command=self.command_line, device=self.device, threads=self._threads())
         tally = Tally()
         with log.stage("batch", wait=False):

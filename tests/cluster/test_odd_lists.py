@@ -1,4 +1,4 @@
-"""Lists and folders as people really have them: comments, marks of editors, names of other languages, results inside."""
+"""Lists and folders as people really have them: comments, marks of editors, other languages, results inside."""
 
 import json
 import os
