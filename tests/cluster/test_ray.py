@@ -1,7 +1,10 @@
 """The Ray engine does what the local one does, and starts nothing that others could reach."""
 
+import json
 import os
 import signal
+import subprocess
+import sys
 import threading
 import time
 from importlib.util import find_spec
@@ -12,6 +15,7 @@ import pytest
 from sgwarp.cluster.local import LocalEngine
 from sgwarp.cluster.ray_engine import RayEngine
 from sgwarp.cluster.tasks import Limits
+from sgwarp.errors import InputError
 
 pytestmark = [
     pytest.mark.skipif(find_spec("ray") is None, reason="needs Ray"),
@@ -48,8 +52,9 @@ def listening(pids: set[int]) -> set[str]:
 
 def test_ray_gives_the_same_bytes_through_faults(batch):
     batch.add("scene02", "fails")
+    batch.add("scene05", "eats")
     batch.add("scene07", "hangs")
-    limits, killed, addresses = Limits(seconds=6.0), [], set()
+    limits, killed, addresses = Limits(seconds=6.0, memory=500_000_000), [], set()
     stop = threading.Event()
 
     def disturb() -> None:
@@ -77,7 +82,51 @@ def test_ray_gives_the_same_bytes_through_faults(batch):
     assert addresses <= {"127.0.0.1", "::1", "::ffff:127.0.0.1"}
     local = batch.statuses(LocalEngine(2)(batch.slower(0.1).tasks("local", limits=limits)))
     assert through_ray == local
-    assert {name for name, status in local.items() if status == "failed"} == {"scene02", "scene07"}
+    assert {name for name, status in local.items() if status == "failed"} == {"scene02", "scene05", "scene07"}
     assert batch.results("ray") == batch.results("local")
-    assert len(batch.results("ray")) == 20
+    assert len(batch.results("ray")) == 18
+    assert "more than the limit of 0.5 GB" in batch.record("scene05", "failed.json", "ray")["error"]
     assert "time limit of 6 s" in batch.record("scene07", "failed.json", "ray")["error"]
+
+
+DRIVER = """
+import json, sys
+sys.path[:0] = {paths!r}
+from sgwarp.cluster.ray_engine import RayEngine
+from sgwarp.cluster.tasks import Task
+for outcome in RayEngine(1)([Task.from_json(values) for values in json.loads(sys.stdin.read())]):
+    print(outcome.name, outcome.status, flush=True)
+"""
+
+
+def test_a_killed_driver_takes_its_ray_with_it_and_loses_nothing(batch):
+    import psutil
+
+    tasks = batch.slower(0.3).tasks()[:6]
+    command = [sys.executable, "-c", DRIVER.format(paths=sys.path)]
+    with subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True) as driver:
+        driver.stdin.write(json.dumps([task.to_json() for task in tasks]))
+        driver.stdin.close()
+        assert driver.stdout.readline() == "scene00 done\n"
+        family = psutil.Process(driver.pid).children(recursive=True)
+        driver.kill()
+    assert family
+    _, living = psutil.wait_procs(family, timeout=60)
+    assert not living
+    found = batch.statuses(list(LocalEngine(1)(tasks)))
+    assert found["scene00"] == "skipped"
+    assert set(found.values()) == {"skipped", "done"}
+    assert batch.folders() == [task.name for task in tasks]
+    batch.statuses(list(LocalEngine(1)(batch.tasks("undisturbed")[:6])))
+    assert batch.results() == batch.results("undisturbed")
+
+
+def test_a_cluster_that_is_not_there_is_bad_input(batch, monkeypatch):
+    class Ray:
+        def init(self, **settings):
+            assert settings["address"] == "10.0.0.1:6379"
+            raise ConnectionError("no answer\nat all")
+
+    monkeypatch.setattr("sgwarp.cluster.ray_engine._import_ray", lambda alone: Ray())
+    with pytest.raises(InputError, match=r"--address 10.0.0.1:6379: Ray does not answer \(no answer\).*RAY_AUTH_MODE"):
+        list(RayEngine(1, address="10.0.0.1:6379")(batch.tasks()))
