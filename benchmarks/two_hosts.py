@@ -20,10 +20,12 @@ PORT = 6399
 
 @dataclass(frozen=True)
 class Hosts:
-    """Names of the namespaces; the head has the address HEAD, the other one OTHER."""
+    """Names of the namespaces; the head has the address HEAD, the other one OTHER. Then the ends of the cable."""
 
     head: str
     other: str
+    head_end: str
+    other_end: str
 
     def command(self, host: str, words: Sequence[str]) -> list[str]:
         """The command line that runs `words` on a host."""
@@ -52,8 +54,8 @@ def two_hosts() -> Iterator[Hosts]:
         RuntimeError: The system refuses one of them.
     """
     number = os.getpid()
-    hosts = Hosts(f"sgwarp-a-{number}", f"sgwarp-b-{number}")
-    ends = {hosts.head: (f"sga{number}", HEAD), hosts.other: (f"sgb{number}", OTHER)}
+    hosts = Hosts(f"sgwarp-a-{number}", f"sgwarp-b-{number}", f"sga{number}", f"sgb{number}")
+    ends = {hosts.head: (hosts.head_end, HEAD), hosts.other: (hosts.other_end, OTHER)}
     try:
         for host in ends:
             _ip("netns", "add", host)
