@@ -7,6 +7,7 @@ import subprocess
 import sys
 import threading
 import time
+from dataclasses import replace
 from importlib.util import find_spec
 from pathlib import Path
 
@@ -14,7 +15,7 @@ import pytest
 
 from sgwarp.cluster.local import LocalEngine
 from sgwarp.cluster.ray_engine import RayEngine
-from sgwarp.cluster.tasks import Limits
+from sgwarp.cluster.tasks import Limits, Task
 from sgwarp.errors import InputError
 
 pytestmark = [
@@ -50,11 +51,17 @@ def listening(pids: set[int]) -> set[str]:
     return found
 
 
+def limited(tasks: list[Task]) -> list[Task]:
+    """With the limits that scene05 and scene07 exceed."""
+    limits = {"scene05": Limits(memory=350_000_000), "scene07": Limits(seconds=6.0)}
+    return [replace(task, limits=limits.get(task.name, task.limits)) for task in tasks]
+
+
 def test_ray_gives_the_same_bytes_through_faults(batch):
     batch.add("scene02", "fails")
     batch.add("scene05", "eats")
     batch.add("scene07", "hangs")
-    limits, killed, addresses = Limits(seconds=8.0, memory=350_000_000), [], set()
+    killed, addresses = [], set()
     stop = threading.Event()
 
     def disturb() -> None:
@@ -72,7 +79,7 @@ def test_ray_gives_the_same_bytes_through_faults(batch):
     thread = threading.Thread(target=disturb)
     thread.start()
     try:
-        through_ray = batch.statuses(RayEngine(2)(batch.slower(0.1).tasks("ray", limits=limits)))
+        through_ray = batch.statuses(RayEngine(2)(limited(batch.slower(0.1).tasks("ray"))))
     finally:
         stop.set()
         thread.join()
@@ -80,13 +87,13 @@ def test_ray_gives_the_same_bytes_through_faults(batch):
     assert os.environ["RAY_USAGE_STATS_ENABLED"] == "0"
     assert addresses
     assert addresses <= {"127.0.0.1", "::1", "::ffff:127.0.0.1"}
-    local = batch.statuses(LocalEngine(2)(batch.slower(0.1).tasks("local", limits=limits)))
+    local = batch.statuses(LocalEngine(2)(limited(batch.slower(0.1).tasks("local"))))
     assert through_ray == local
     assert {name for name, status in local.items() if status == "failed"} == {"scene02", "scene05", "scene07"}
     assert batch.results("ray") == batch.results("local")
     assert len(batch.results("ray")) == 18
     assert "more than the limit of 0.35 GB" in batch.record("scene05", "failed.json", "ray")["error"]
-    assert "time limit of 8 s" in batch.record("scene07", "failed.json", "ray")["error"]
+    assert "time limit of 6 s" in batch.record("scene07", "failed.json", "ray")["error"]
 
 
 DRIVER = """
