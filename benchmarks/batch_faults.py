@@ -64,7 +64,7 @@ def place(engine: str) -> Iterator[tuple[Place, tuple[str, ...]]]:
     if engine != "hosts":
         yield Place(engine), ()
         return
-    ENVIRONMENT.update(RAY_AUTH_MODE="token", RAY_AUTH_TOKEN=secrets.token_hex(32))
+    ENVIRONMENT.update(RAY_worker_niceness="0", RAY_AUTH_MODE="token", RAY_AUTH_TOKEN=secrets.token_hex(32))
     with two_hosts() as hosts, ray_cluster(hosts, 2, ENVIRONMENT) as roots:
         yield Place("ray", roots), ("--address", f"{HEAD}:{PORT}")
 

@@ -17,6 +17,7 @@ from sgwarp.cluster.working import give_up, work
 from sgwarp.errors import InputError
 
 AHEAD = 2  # tasks handed to Ray per worker: the next one is there when a worker is free
+ALONE = {"RAY_worker_niceness": "0"}  # of a Ray of our own; else its workers give way to all others, at 15
 STORE = 100_000_000  # bytes of Ray's object store on this machine; only paths travel
 _prepared: set[str] = set()  # in a worker of Ray
 
@@ -50,7 +51,7 @@ class RayEngine:
             InputError: Ray is not installed, or its cluster is not to be reached.
         """
         ray = _import_ray(alone=self.address is None)
-        with _environment(self._variables() if self.address is None else {}):
+        with _environment(self._variables() | ALONE if self.address is None else {}):
             self._connect(ray)
             try:
                 yield from self._run(ray, iter(tasks))

@@ -7,6 +7,7 @@ import subprocess
 import sys
 import threading
 import time
+from contextlib import suppress
 from dataclasses import replace
 from importlib.util import find_spec
 from pathlib import Path
@@ -61,7 +62,7 @@ def test_ray_gives_the_same_bytes_through_faults(batch):
     batch.add("scene02", "fails")
     batch.add("scene05", "eats")
     batch.add("scene07", "hangs")
-    killed, addresses = [], set()
+    killed, addresses, niceness = [], set(), set()
     stop = threading.Event()
 
     def disturb() -> None:
@@ -71,6 +72,9 @@ def test_ray_gives_the_same_bytes_through_faults(batch):
             if not addresses and workers():
                 family = {child.pid for child in psutil.Process().children(recursive=True)}
                 addresses.update(listening(family))
+            if not niceness and (found := workers()):
+                with suppress(OSError):  # it has ended
+                    niceness.add(os.getpriority(os.PRIO_PROCESS, found[0]))
             if len(killed) < 2 and workers():
                 killed.append(workers()[0])
                 os.kill(killed[-1], signal.SIGKILL)
@@ -86,6 +90,7 @@ def test_ray_gives_the_same_bytes_through_faults(batch):
     assert len(killed) == 2
     assert os.environ["RAY_USAGE_STATS_ENABLED"] == "0"
     assert addresses
+    assert niceness == {os.getpriority(os.PRIO_PROCESS, 0)}
     assert addresses <= {"127.0.0.1", "::1", "::ffff:127.0.0.1"}
     local = batch.statuses(LocalEngine(2)(limited(batch.slower(0.1).tasks("local"))))
     assert through_ray == local
