@@ -1,12 +1,13 @@
 """Does the network learn what it is lifted? Procedural rooms: trained on some, measured on others.
 
-    python benchmarks/distill.py [--train 12] [--test 4] [--epochs 40] [--out benchmarks/distill.json]
+    python benchmarks/distill.py [--train 12] [--test 4] [--epochs 40] [--loss cosine] [--out benchmarks/distill.json]
 
 The stand-in for a 2D encoder sees the rooms' true pieces of furniture and names them with errors, in the words of a toy
 text space: in every view a piece is taken for something else with probability 0.25, and some pieces (0.15) are taken
 for the same wrong thing in all views of their room, which no averaging over views can repair. Lifted into 12 rooms this
 trains a MinkUNet14A; measured is the mIoU over the Gaussians of the unseen rooms, against the true classes, of the
-projection (2D), the network (3D) and their ensembles, and of a network that sees colours alone.
+projection (2D), the network (3D) and their ensembles, and of a network that sees colours alone. --loss contrastive
+trains on the masks of the same views instead, whose rendered features have to be nearest to the mask's own vector.
 """
 
 from __future__ import annotations
@@ -27,6 +28,7 @@ from sgwarp.network.augmentation import Augmentation
 from sgwarp.network.inputs import InputMode
 from sgwarp.network.prediction import predict
 from sgwarp.network.quality import projection_quality
+from sgwarp.network.training.contrastive import MaskedView
 from sgwarp.network.training.data import TrainingScene
 from sgwarp.network.training.settings import DistillSettings
 from sgwarp.network.training.trainer import distill
@@ -61,8 +63,8 @@ def noisy_classes(truth: Tensor, share: float, rng: torch.Generator) -> Tensor:
     return torch.where(wrong, torch.randint(len(CLASSES), truth.shape, generator=rng), truth)
 
 
-def lifted_room(seed: int, count: int, views: int) -> tuple[Room, Semantics]:
-    """A room and what the erring encoder's maps say of it."""
+def lifted_room(seed: int, count: int, views: int) -> tuple[Room, Semantics, list[MaskedView]]:
+    """A room, what the erring encoder's maps say of it, and those maps."""
     room, text = make_room(seed, count), ToyText()
     rng = torch.Generator().manual_seed(seed + 10_000)
     believed = noisy_classes(room.class_of_piece, WRONG_IN_A_ROOM, rng)
@@ -75,7 +77,8 @@ def lifted_room(seed: int, count: int, views: int) -> tuple[Room, Semantics]:
         vectors = named + 0.1 * torch.randn(named.shape, generator=rng)
         maps[view.stem] = FeatureMap("toy", ids=ids, vectors=vectors)
         posed.append(view)
-    return room, lift(room.gaussians, posed, maps)
+    semantics = lift(room.gaussians, posed, maps)
+    return room, semantics, [MaskedView(view.camera, maps[view.stem]) for view in posed]
 
 
 def measure(rooms: list[tuple[Room, Semantics]], predicted: list[Semantics]) -> dict[str, dict[str, float]]:
@@ -109,18 +112,23 @@ def main() -> None:
     parser.add_argument("--voxel", type=float, default=0.1)
     parser.add_argument("--arch", default="14A")
     parser.add_argument("--inputs", nargs="+", default=["full", "xyz-rgb"])
+    parser.add_argument("--loss", choices=["cosine", "contrastive"], default="cosine")
     parser.add_argument("--out", type=Path, default=Path(__file__).with_name("distill.json"))
     options = parser.parse_args()
     rooms = [lifted_room(seed, options.count, options.views) for seed in range(options.train + options.test)]
-    train, test = rooms[: options.train], rooms[options.train :]
+    train, test = rooms[: options.train], [(room, semantics) for room, semantics, _ in rooms[options.train :]]
     quality = [projection_quality(semantics) for _, semantics in test]
     results: dict[str, object] = json.loads(options.out.read_text()) if options.out.exists() else {}
-    results |= {name: value for name, value in vars(options).items() if name not in ("out", "inputs")}
+    results |= {name: value for name, value in vars(options).items() if name not in ("out", "inputs", "loss", "epochs")}
     results["coverage of the test rooms"] = sum(q.coverage for q in quality) / len(quality)
     results["reliability of the test rooms"] = sum(q.reliability for q in quality) / len(quality)
     scenes = [
-        TrainingScene(f"room {k}", lambda pair=pair: (pair[0].gaussians, pair[1]))  # type: ignore[misc]
-        for k, pair in enumerate(train)
+        TrainingScene(
+            f"room {k}",
+            lambda room=room, semantics=semantics: (room.gaussians, semantics),  # type: ignore[misc]
+            masks=lambda views=views: [lambda view=view: view for view in views],  # type: ignore[misc]
+        )
+        for k, (room, semantics, views) in enumerate(train)
     ]
     settings = DistillSettings(
         arch=options.arch,
@@ -128,6 +136,7 @@ def main() -> None:
         epochs=options.epochs,
         scenes_per_step=2,
         augment=Augmentation(up=1, elastic=()),
+        loss=options.loss,
     )
     for inputs in options.inputs:
         mode: InputMode = inputs
@@ -136,8 +145,14 @@ def main() -> None:
         seconds = time.perf_counter() - start
         predicted = [predict(room.gaussians, network).semantics() for room, _ in test]
         figures = measure(test, predicted)
-        results[inputs] = {"seconds": seconds, "loss": [epoch.loss for epoch in history], **figures}
-        print(f"{inputs}: {seconds:.0f} s, loss {history[0].loss:.3f} to {history[-1].loss:.3f}")
+        name = inputs if options.loss == "cosine" else f"{inputs}, {options.loss}"
+        results[name] = {
+            "epochs": options.epochs,
+            "seconds": seconds,
+            "loss": [epoch.loss for epoch in history],
+            **figures,
+        }
+        print(f"{name}: {seconds:.0f} s, loss {history[0].loss:.3f} to {history[-1].loss:.3f}")
         for how, row in figures.items():
             print(
                 f"  {how:5s} mIoU {row['mIoU']:.3f}  mAcc {row['mAcc']:.3f}  unknown {row['unknown']:.3f}", flush=True

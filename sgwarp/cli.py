@@ -29,6 +29,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     Raises:
         SystemExit: After --help, or with code 2 if the arguments do not fit.
     """
+    _open_closed_streams()
     _write_any_text()
     try:
         with termination_as_interrupt():
@@ -92,6 +93,18 @@ def _fail(message: str, code: int) -> int:
     with suppress(OSError):
         print(f"sgwarp: {printable(message)}", file=sys.stderr, flush=True)
     return code
+
+
+def _open_closed_streams() -> None:
+    """`sgwarp ... >&-`: the next file that is opened would get the number of the closed stream, and its output."""
+    for number, name in enumerate(("stdin", "stdout", "stderr")):
+        try:
+            os.fstat(number)
+        except OSError:
+            os.open(os.devnull, os.O_RDWR)  # takes the lowest number that is free
+        if getattr(sys, name) is None:
+            stream = open(number, "w" if number else "r", encoding="utf-8", closefd=False)  # noqa: SIM115
+            setattr(sys, name, stream)
 
 
 def _write_any_text() -> None:

@@ -104,6 +104,39 @@ def test_constraints_pin_every_requirement():
     assert "torch==2.13.0" in pins
 
 
+def test_what_extras_ask_for():
+    """Extras within extras are resolved without a build of the package, which would fetch its tools unseen."""
+    sys.path.insert(0, str(ROOT))
+    try:
+        from tools.install import requirements
+    finally:
+        sys.path.remove(str(ROOT))
+    plain, demo = requirements([]), requirements(["demo"])
+    assert any(text.startswith("torch") for text in plain)
+    assert set(plain) < set(demo)
+    assert any(text.startswith("tyro") for text in demo)
+    assert not any(text.startswith("sgwarp") for text in demo)
+    with pytest.raises(KeyError):
+        requirements(["none"])
+
+
+def test_an_install_without_hashes_fails(monkeypatch, capsys):
+    sys.path.insert(0, str(ROOT))
+    try:
+        from tools import install
+    finally:
+        sys.path.remove(str(ROOT))
+    ran = []
+    monkeypatch.setattr(install.subprocess, "run", lambda command, **_: ran.append(command))
+    with pytest.raises(LookupError, match=r"torch==0\.0"):
+        install._install_hashed([("torch", "0.0")])
+    assert ran == []
+    monkeypatch.setattr(install, "_install", lambda wanted: install._install_hashed([("torch", "0.0")]))
+    assert install.main("demo") == 1
+    assert "has no hashes of torch==0.0; run make lock" in capsys.readouterr().err
+    assert "export HASHED=1" in (ROOT / ".ci" / "run").read_text()
+
+
 def test_the_lock_has_hashes_of_every_pin():
     """`make lock` after constraints.txt has changed."""
     sys.path.insert(0, str(ROOT))

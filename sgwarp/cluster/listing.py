@@ -11,11 +11,13 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 from sgwarp.errors import InputError
+from sgwarp.files.access import read_bytes
 
 RESERVED = ("shards",)  # folders of the output that are no scenes
 LONGEST = 200  # bytes of a name: file systems hold 255, and a folder at work adds some
 POINTS = ("points3D.ply", "sparse_pc.ply", "point_cloud.ply")  # of data sets, to start a fit from
 MAGIC = ("*", "?", "[")
+LARGEST = 1 << 26  # bytes of a list
 
 
 class MissingScene(InputError):
@@ -51,12 +53,12 @@ def list_scenes(source: str, out: Path | None = None) -> list[Scene]:
     """
     path = Path(source)
     found: list[tuple[str, Path, dict[str, str]]]
-    if path.is_dir():
+    if os.path.isdir(path):
         entries = sorted(p for p in path.iterdir() if p.name[0] != "." and (p.is_dir() or p.suffix == ".ply"))
         found = [(_name(p), p, {}) for p in entries if not _same_place(p, out)]
-    elif path.suffix.lower() == ".csv" and path.is_file():
+    elif path.suffix.lower() == ".csv" and os.path.isfile(path):
         found = list(_csv_rows(path))
-    elif path.is_file():
+    elif os.path.isfile(path):
         found = list(_text_lines(path))
     elif any(mark in source for mark in MAGIC):
         matches = sorted(p for p in map(Path, glob.glob(source, recursive=True)) if not _same_place(p, out))
@@ -105,6 +107,14 @@ def _csv_rows(path: Path) -> Iterator[tuple[str, Path, dict[str, str]]]:
     lines = ["" if line.startswith("#") else line for line in _read(path).splitlines()]
     before = next((number for number, line in enumerate(lines) if line), 0)  # lines before the names of the columns
     rows = csv.DictReader(lines[before:])
+    try:
+        yield from _scenes_of(path, rows, before)
+    except csv.Error as error:  # of a cell without end, for one
+        line = before + rows.line_num
+        raise InputError(f"{path}: line {line} cannot be read ({error}); quote cells in pairs") from None
+
+
+def _scenes_of(path: Path, rows: csv.DictReader[str], before: int) -> Iterator[tuple[str, Path, dict[str, str]]]:
     heads = [head.strip() for head in rows.fieldnames or ()]
     if "path" not in heads:
         raise InputError(f"{path}: has no column 'path'; its first line names the columns: path,name,fit.steps,...")
@@ -142,8 +152,8 @@ def _text_lines(path: Path) -> Iterator[tuple[str, Path, dict[str, str]]]:
 
 def _read(path: Path) -> str:
     try:
-        return path.read_text(encoding="utf-8-sig")
-    except (OSError, UnicodeDecodeError) as error:
+        return read_bytes(path, LARGEST).decode("utf-8-sig")
+    except UnicodeDecodeError as error:
         raise InputError(f"{path}: cannot be read as text ({error}); a list is UTF-8 text") from None
 
 

@@ -151,8 +151,8 @@ def fingerprint(paths: tuple[str, ...], contents: bool) -> dict[str, dict[str, A
 
 
 def _fingerprint(path: Path, contents: bool) -> dict[str, Any]:
-    files = [path] if path.is_file() else sorted(_files_below(path))
-    if not path.exists():
+    files = [path] if os.path.isfile(path) else sorted(_files_below(path))
+    if not os.path.exists(path):
         raise InputError(f"{path}: no such file or folder; check the list of scenes")
     states, whole, size = hashlib.sha256(), hashlib.sha256(), 0
     try:
@@ -171,7 +171,8 @@ def _fingerprint(path: Path, contents: bool) -> dict[str, Any]:
 def _files_below(folder: Path) -> Iterator[Path]:
     for place, folders, names in os.walk(folder):
         folders[:] = sorted(name for name in folders if not name.startswith("."))
-        yield from (Path(place) / name for name in names if not name.startswith("."))
+        # A pipe among them would be read without end.
+        yield from (path for name in names if not name.startswith(".") and os.path.isfile(path := Path(place) / name))
 
 
 def _hash(path: Path) -> bytes:

@@ -10,7 +10,9 @@ from sgwarp.commands.options import Options, check_folder
 from sgwarp.runs.progress import show_progress
 
 if TYPE_CHECKING:
+    from sgwarp.scene import Semantics
     from sgwarp.viewer.live import Live
+    from sgwarp.viewer.workbench import Workbench
 
 
 @dataclass(kw_only=True)
@@ -41,13 +43,18 @@ class Demo(Options):
     def _live(self) -> Live:
         from sgwarp.demo.data import Room
         from sgwarp.demo.run import ENCODER
-        from sgwarp.encoders.registry import make_text_encoder
+        from sgwarp.encoders.registry import image_tower_for, make_text_encoder
         from sgwarp.viewer.live import Live
         from sgwarp.viewer.workbench import Materials, Workbench
 
         room = Room.load().to(self.device)
         text = make_text_encoder(ENCODER, self.device)
+        tower = image_tower_for(text.space, self.device)
+
+        def begin(semantics: Semantics) -> Workbench:
+            return Workbench(Materials(room.gaussians, semantics, None, text, views=room.views, make_tower=tower))
+
         return Live(
-            lambda semantics: Workbench(Materials(room.gaussians, semantics, None, text, views=room.views)),
+            begin,
             Workbench.replace_semantics,
         )

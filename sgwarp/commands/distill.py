@@ -71,6 +71,9 @@ class Distill(Options):
     """Encoder of the masks for the contrastive loss, the one that the scenes were lifted with; {views} stands for a
     scene's folder of views, as in files:{views}/labels."""
 
+    images: str | None = None
+    """Name of a COLMAP model's folder of photographs, if it is not `images` nor the only one that holds them."""
+
     views_per_step: int = 2
     """Views of a scene that the contrastive loss looks at in a step."""
 
@@ -160,7 +163,7 @@ class Distill(Options):
         from sgwarp.io.views import load_views
         from sgwarp.network.training.contrastive import MaskedView
 
-        views = load_views(folder)
+        views = load_views(folder, self.images)
         source = make_encoder(self.encoder.replace("{views}", str(folder)), views, self.device, default_folder())
         has_map = getattr(source, "has_map", lambda view: True)
 

@@ -31,8 +31,10 @@ class Evaluate(Options):
     profile: tyro.conf.Positional[
         Literal[
             "room",
+            "room-instances",
             "scannet12-2d",
             "scannet-3d",
+            "scannet-instances",
             "lerf-ovs-loc",
             "lerf-ovs-seg",
             "lerf-ovs-3d",

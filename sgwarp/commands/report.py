@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from pathlib import Path
 
-from sgwarp.commands.options import SceneOptions, check_folder, find_views
+from sgwarp.commands.options import SceneOptions, check_folder, find_views, place_views
 
 
 @dataclass(kw_only=True)
@@ -14,6 +14,13 @@ class Report(SceneOptions):
 
     views: Path
     """Posed photographs: a folder with transforms.json or a COLMAP model."""
+
+    transform: Path | None = None
+    """Where the views lie in another world than the scene: the transform between them, such as the
+    dataparser_transforms.json of the trainer that moved the scene."""
+
+    images: str | None = None
+    """Name of a COLMAP model's folder of photographs, if it is not `images` nor the only one that holds them."""
 
     out: Path
     """Folder for report.md, report.json and the plot."""
@@ -45,7 +52,7 @@ class Report(SceneOptions):
             gaussians = self.load_scene(log)
             make_report(
                 gaussians,
-                find_views(self.views),
+                place_views(gaussians, self.scene, find_views(self.views, images=self.images), self.transform),
                 self.out,
                 self.scene.name.split(".")[0],
                 labels=self.labels,

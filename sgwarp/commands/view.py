@@ -39,6 +39,9 @@ class View(SceneOptions):
     """Where the views lie in another world than the scene: the transform between them, such as the
     dataparser_transforms.json of the trainer that moved the scene."""
 
+    images: str | None = None
+    """Name of a COLMAP model's folder of photographs, if it is not `images` nor the only one that holds them."""
+
     encoder: str | None = None
     """Encoder of the phrases; if not given, the one that the semantics were lifted with."""
 
@@ -65,6 +68,7 @@ class View(SceneOptions):
             viewer.close()
 
     def _materials(self, log: RunLog) -> Materials:
+        from sgwarp.encoders.registry import image_tower_for
         from sgwarp.io.instances import load_instances
         from sgwarp.io.sequences import is_sequence, load_sequence
         from sgwarp.viewer.workbench import Materials
@@ -95,6 +99,7 @@ class View(SceneOptions):
             None if self.instances is None else load_instances(self.instances, gaussians),
             [] if self.views is None else self._views(gaussians),
             sequence,
+            None if encoder is None else image_tower_for(encoder.space, self.device),
         )
 
     def _maker(self, semantics: Semantics) -> Callable[[str | None], TextEncoder]:
@@ -111,7 +116,7 @@ class View(SceneOptions):
     def _views(self, gaussians: Gaussians) -> list[Viewpoint]:
         assert self.views is not None
         try:
-            views = find_views(self.views, photographs=False)
+            views = find_views(self.views, photographs=False, images=self.images)
         except InputError:
-            views = find_views(self.views)
+            views = find_views(self.views, images=self.images)
         return views if self.transform is None else place_views(gaussians, self.scene, views, self.transform)

@@ -17,7 +17,7 @@ from torch import Tensor
 from sgwarp.compat.gsplat.checks import widen
 from sgwarp.errors import InputError
 from sgwarp.ops.neighbors import mean_squared_neighbor_distance
-from sgwarp.ops.planar.harmonics import harmonics_sum
+from sgwarp.ops.planar.harmonics import harmonic_colors
 from sgwarp.ops.planar.projection import (
     ProjectedSplats,
     ProjectionSettings,
@@ -28,6 +28,7 @@ from sgwarp.ops.planar.projection import (
 from sgwarp.ops.planar.splats import SplatJob, composite_splats
 from sgwarp.ops.splatting.settings import RasterSettings
 from sgwarp.runs.isolation import isolated
+from sgwarp.scene.checks import require_finite
 
 NEAR = 0.2  # [m]
 ALPHA_MAX = 0.99
@@ -79,6 +80,7 @@ class GaussianRasterizer(torch.nn.Module):
         """Mask of the points [N, 3] in front of the near plane, bool [N]."""
         with torch.no_grad():
             view = self.raster_settings.viewmatrix
+            require_finite("viewmatrix", view)
             return positions @ view[:3, 2].to(positions) + view[3, 2].to(positions) > NEAR
 
     @isolated
@@ -153,7 +155,8 @@ class GaussianRasterizer(torch.nn.Module):
             values = select_rows(colors_precomp, p.index)
         else:
             directions = select_rows(means3D, p.index) - settings.campos.to(means3D)
-            values = (harmonics_sum(directions, select_rows(shs, p.index), settings.sh_degree) + 0.5).clamp(min=0.0)
+            colors, shown = harmonic_colors(directions, select_rows(shs, p.index), settings.sh_degree)
+            values = torch.where(shown[:, None], colors, torch.nan)  # which is left out
         channels, wants_depth = values.shape[1], settings.antialiasing is not None
         if wants_depth:
             values = torch.cat([values, 1.0 / p.depths[:, None]], dim=1)
@@ -272,6 +275,8 @@ def _check(
             raise InputError(f"shs: expected [{n}, at least {count}, 3] for sh_degree {settings.sh_degree}")
     if tuple(settings.bg.shape) != (channels,):
         raise InputError(f"bg: expected shape [{channels}], got {list(settings.bg.shape)}")
+    for name in ("viewmatrix", "projmatrix", "campos", "bg", "tanfovx", "tanfovy", "scale_modifier"):
+        require_finite(name, getattr(settings, name))
 
 
 def _joined(dc: Tensor, shs: Tensor | None, count: int) -> Tensor:
@@ -288,6 +293,10 @@ def _joined(dc: Tensor, shs: Tensor | None, count: int) -> Tensor:
 def _intrinsics(settings: GaussianRasterizationSettings) -> Tensor:
     """Pinhole intrinsics [pixels] of the settings, float64 [3, 3]: focal lengths of tanfov, centre of projmatrix."""
     view, full = (m.detach().to(torch.float64).cpu() for m in (settings.viewmatrix, settings.projmatrix))
+    require_finite("viewmatrix", view)  # those of CUDA, too: they are here now
+    require_finite("projmatrix", full)
+    if torch.linalg.det(view).item() == 0:
+        raise InputError("viewmatrix: has no inverse; expected world to camera, transposed")
     P = torch.linalg.inv(view) @ full
     w = P[2, 3].item()
     off_axis = max(abs(P[i, j].item()) for i, j in ((0, 1), (1, 0), (0, 3), (1, 3)))
@@ -299,7 +308,8 @@ def _intrinsics(settings: GaussianRasterizationSettings) -> Tensor:
         slope = P[axis, axis].item() / w
         if not abs(slope * tangent - 1.0) < FOCAL_TOLERANCE:
             name = "tanfovx" if axis == 0 else "tanfovy"
-            raise InputError(f"{name}: {tangent:g} contradicts projmatrix, which says {1.0 / slope:g}")
+            said = 1.0 / slope if slope else math.inf
+            raise InputError(f"{name}: {tangent:g} contradicts projmatrix, which says {said:g}")
         K[axis, axis] = 0.5 * size / tangent
         K[axis, 2] = 0.5 * size * (1.0 + P[2, axis].item() / w)
     return K

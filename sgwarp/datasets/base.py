@@ -88,6 +88,7 @@ class SceneData:
         classes: Names of the classes of labels, points and ids.
         labelled: Stems of the views with label images.
         load_labels: Reads a label image: class of every pixel, -1 where not scored, int64 [h, w] at its own size.
+        load_instances: Reads an image of objects: number of the object at every pixel, 0 for none, int64 [h, w].
         load_queries: Reads the phrases with their objects.
         load_scribbles: Reads the strokes.
         load_points: Reads the points with classes.
@@ -103,6 +104,7 @@ class SceneData:
     classes: tuple[str, ...] = ()
     labelled: tuple[str, ...] = ()
     load_labels: Callable[[str], Tensor] | None = None
+    load_instances: Callable[[str], Tensor] | None = None
     load_queries: Callable[[], list[Query]] | None = None
     load_scribbles: Callable[[], Scribbles] | None = None
     load_points: Callable[[], LabelledPoints] | None = None

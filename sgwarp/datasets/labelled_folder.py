@@ -4,6 +4,7 @@
 |---|---|
 | transforms.json or sparse/0 | views |
 | labels/{stem}.png | ids, 0 = void |
+| instances/{stem}.png | numbers of objects, the same in all views, 0 = none; if there are any |
 | classes.json | names by id, a list from id 1 on or {"1": "couch", ...} |
 | depth/{stem}.png | uint16 [mm], if there is depth |
 | scene.ply | the trained scene, if there is one |
@@ -65,6 +66,9 @@ def open_scene(root: Path, name: str) -> SceneData:
     def depth(view: View) -> NDArray[np.float32]:
         return read_ids(folder / "depth" / f"{view.stem}.png").astype(np.float32) * np.float32(0.001)
 
+    def instances(stem: str) -> Tensor:
+        return torch.from_numpy(read_ids(folder / "instances" / f"{stem}.png")).long()
+
     has_depth = (folder / "depth").is_dir()
     return SceneData(
         name,
@@ -75,6 +79,7 @@ def open_scene(root: Path, name: str) -> SceneData:
         classes=classes,
         labelled=labelled,
         load_labels=labels if labelled else None,
+        load_instances=instances if (folder / "instances").is_dir() else None,
         load_depth=depth if has_depth else None,
         gaussians=trained_in(folder),
     )

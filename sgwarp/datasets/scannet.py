@@ -8,6 +8,7 @@
 | intrinsic/intrinsic_color.txt | 4 x 4 |
 | label-filt/{i}.png, instance-filt/{i}.png | uint16 raw ids, and objects |
 | {scene}_vh_clean_2.labels.ply | vertices with their nyu40 id |
+| {scene}_vh_clean_2.0.010000.segs.json, {scene}.aggregation.json | segment of each vertex, and objects by segments |
 
 Scenes lie in the root, in `scans` or in `scans_test`; scannetv2-labels.combined.tsv beside them or in the root.
 Photographs may be smaller than they were taken (648 x 484 is usual): the intrinsics follow.
@@ -28,6 +29,7 @@ from sgwarp.datasets.base import LabelledPoints, SceneData, absent, folders_in, 
 from sgwarp.datasets.scannet_classes import COCO20, TABLE, coco_table, read_label_table, to_nyu40
 from sgwarp.errors import InputError
 from sgwarp.files.access import read_bytes
+from sgwarp.files.documents import read_json
 from sgwarp.files.images import read_ids, read_size
 from sgwarp.scene import Camera, View
 from sgwarp.scene.extent import with_near_plane
@@ -38,6 +40,7 @@ SCENE = re.compile(r"scene\d{4}_\d{2}")
 PLACES = (".", "scans", "scans_test")
 TAKEN = ((1296, 968), (640, 480))  # widths and heights that ScanNet's intrinsics may be for
 LARGEST_MATRIX = 1 << 16  # bytes
+AGGREGATIONS = (".aggregation.json", "_vh_clean.aggregation.json")
 
 
 def list_scenes(root: Path) -> list[str]:
@@ -81,6 +84,9 @@ def open_scene(root: Path, name: str) -> SceneData:
     def depth(view: View) -> NDArray[np.float32]:
         return read_ids(folder / "depth" / f"{view.stem}.png").astype(np.float32) * np.float32(0.001)
 
+    def instances(stem: str) -> Tensor:
+        return torch.from_numpy(read_ids(folder / "instance-filt" / f"{stem}.png")).long()
+
     return SceneData(
         name,
         folder,
@@ -90,6 +96,7 @@ def open_scene(root: Path, name: str) -> SceneData:
         classes=tuple(COCO20),
         labelled=labelled if table else (),
         load_labels=labels if table and labelled else None,
+        load_instances=instances if (folder / "instance-filt").is_dir() else None,
         load_points=(lambda: read_mesh(folder)) if _mesh(folder) else None,
         load_depth=depth if (folder / "depth").is_dir() else None,
         gaussians=trained_in(folder),
@@ -152,10 +159,10 @@ def read_matrix(path: Path) -> NDArray[np.float64]:
 
 
 def read_mesh(folder: Path) -> LabelledPoints:
-    """Vertices of the labelled mesh; their labels are nyu40 ids, 0 where there is none.
+    """Vertices of the labelled mesh; their labels are nyu40 ids, 0 where there is none; objects, if they lie there.
 
     Raises:
-        InputError: The mesh cannot be read.
+        InputError: The mesh or its objects cannot be read.
     """
     from sgwarp.io.ply import read_elements
 
@@ -166,4 +173,30 @@ def read_mesh(folder: Path) -> LabelledPoints:
         raise InputError(f"{path}: expected vertices with x, y, z and label; download the labelled mesh")
     positions = np.stack([vertex[axis] for axis in "xyz"], axis=1).astype(np.float32)
     labels = torch.from_numpy(vertex["label"].astype(np.int64))
-    return LabelledPoints(torch.from_numpy(positions), torch.where((labels >= 0) & (labels <= 40), labels, 0))
+    labels = torch.where((labels >= 0) & (labels <= 40), labels, 0)
+    return LabelledPoints(torch.from_numpy(positions), labels, _read_objects(folder, len(labels)))
+
+
+def _read_objects(folder: Path, count: int) -> Tensor | None:
+    """Object of each vertex from 1 on, 0 for none, int64 [count]; None if the two files do not lie there.
+
+    Raises:
+        InputError: One of them is damaged, or belongs to another mesh.
+    """
+    segments = folder / f"{folder.name}_vh_clean_2.0.010000.segs.json"
+    groups = next((p for p in (folder / f"{folder.name}{end}" for end in AGGREGATIONS) if p.is_file()), None)
+    if not segments.is_file() or groups is None:
+        return None
+    try:
+        of_vertex = np.array(read_json(segments)["segIndices"], dtype=np.int64)
+        objects = [(g["objectId"] + 1, s) for g in read_json(groups)["segGroups"] for s in g["segments"]]
+        numbers, ids = np.array(objects, dtype=np.int64).reshape(-1, 2).T
+    except (KeyError, TypeError, ValueError, OverflowError):
+        raise InputError(f"{segments}, {groups.name}: hold no segIndices or segGroups; download them again") from None
+    if of_vertex.shape != (count,):
+        raise InputError(f"{segments}: {of_vertex.size} vertices, but the mesh has {count}; download both again")
+    if not len(ids):
+        return torch.zeros(count, dtype=torch.int64)
+    order = ids.argsort(kind="stable")
+    place = np.searchsorted(ids[order], of_vertex).clip(max=len(ids) - 1)
+    return torch.from_numpy(np.where(ids[order][place] == of_vertex, numbers[order][place], 0))

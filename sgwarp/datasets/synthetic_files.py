@@ -31,14 +31,20 @@ def room_truth(room: Room, camera: Camera) -> tuple[Tensor, Tensor]:
         classes: Index into CLASSES, -1 where the ray leaves the room, int64 [H, W].
         depth: Along the optical axis [m], 0 where the ray leaves the room, float64 [H, W].
     """
+    pieces, depth = room_pieces(room, camera)
+    return torch.where(pieces >= 0, room.class_of_piece[pieces], -1), depth
+
+
+def room_pieces(room: Room, camera: Camera) -> tuple[Tensor, Tensor]:
+    """As `room_truth`, with the number of the wall or piece of furniture in place of its class."""
     y, x = torch.meshgrid(*(torch.arange(n, dtype=torch.float64) + 0.5 for n in camera.size), indexing="ij")
     rays = torch.stack([x, y, torch.ones_like(x)], dim=2).reshape(-1, 3) @ torch.linalg.inv(camera.K).T
     rays = rays @ camera.world_to_camera[:3, :3]  # z along the optical axis stays 1: the distance is the depth
     found = [_first_face(room, camera.position, part) for part in rays.split(RAYS_AT_ONCE)]
     face, depth = (torch.cat(each) for each in zip(*found, strict=True))
     seen = torch.isfinite(depth)
-    classes = torch.where(seen, room.class_of_piece[room.piece_of_face[face]], -1)
-    return classes.view(camera.size), torch.where(seen, depth, 0.0).view(camera.size)
+    pieces = torch.where(seen, room.piece_of_face[face], -1)
+    return pieces.view(camera.size), torch.where(seen, depth, 0.0).view(camera.size)
 
 
 def _first_face(room: Room, origin: Tensor, rays: Tensor) -> tuple[Tensor, Tensor]:
@@ -65,6 +71,7 @@ def save_room(
     |---|---|
     | transforms.json, images/{stem}.png | cameras on a round through the room, and what they see, rendered |
     | labels/{stem}.png, classes.json | ids, class k is k + 1 and 0 nothing; names |
+    | instances/{stem}.png | ids, piece k is k + 1 and 0 nothing |
     | depth/{stem}.png | uint16 [mm] |
     | scene.ply | the Gaussians, with their class in the column `label` |
 
@@ -77,10 +84,12 @@ def save_room(
     folder = Path(folder)
     cameras = room_cameras(room, seed, views, width, height)
     for number, camera in enumerate(cameras):
-        classes, depth = room_truth(room, camera)
+        pieces, depth = room_pieces(room, camera)
+        classes = torch.where(pieces >= 0, room.class_of_piece[pieces], -1)
         name = f"{number:04d}.png"
         write_rgb(folder / "images" / name, rasterize(room.gaussians, camera).features.clamp(0, 1))
         write_ids(folder / "labels" / name, (classes + 1).numpy().astype(np.uint8))
+        write_ids(folder / "instances" / name, (pieces + 1).numpy().astype(np.uint16))
         write_ids(folder / "depth" / name, (1000 * depth).round().clamp(max=65535).numpy().astype(np.uint16))
     named = replace(room.gaussians, extras={LABEL: room.classes.numpy().astype(np.int32)})
     save_gaussians(named, folder / "scene.ply")

@@ -9,7 +9,7 @@ from typing import Any
 
 import torch
 
-from sgwarp.encoders.base import MapSource, TextEncoder, require_same_space
+from sgwarp.encoders.base import ImageEncoder, MapSource, TextEncoder, require_same_space
 from sgwarp.encoders.building import Request, builder
 from sgwarp.encoders.building import make_text_encoder as make_text_encoder
 from sgwarp.encoders.catalogue import BY_NAME
@@ -107,6 +107,19 @@ def text_encoder_for(
     encoder = _keep(key, partial(make_text_encoder, name, device, templates))
     require_same_space(space, encoder.space, f"encoder {name}")
     return encoder
+
+
+def image_tower_for(space: str, device: Device = "cpu") -> Callable[[], ImageEncoder] | None:
+    """What makes the encoder of images for a space whose text encoder takes none; None if there is none here."""
+    if space != CONSE_SPACE:
+        return None
+
+    def make() -> ImageEncoder:
+        from sgwarp.encoders.images.conse.encoder import Conse
+
+        return Conse(device=device)
+
+    return make
 
 
 def make_mask_source(name: str, views: Sequence[View] = (), device: Device = "cpu") -> MaskSource:

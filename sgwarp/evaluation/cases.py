@@ -66,11 +66,8 @@ def prepare(scene: SceneData, settings: Settings, split: Split, log: RunLog) -> 
     Raises:
         InputError: Views, Gaussians, an encoder or the method is missing or does not fit.
     """
-    with log.stage("read"):
-        views = scene.need("views")()
-        lifted, scored = split(scene, views, settings)
-    gaussians = _gaussians(scene, settings, lifted, log)
-    case = Case(scene, settings, gaussians, lifted, scored, log)
+    case = read_case(scene, settings, split, log)
+    gaussians = case.gaussians
     if settings.predicted:
         case.predicted = _on(load_semantics(in_scene(settings.predicted, scene), gaussians), gaussians, scene)
         case.predicted.require_scene(gaussians)
@@ -82,6 +79,19 @@ def prepare(scene: SceneData, settings: Settings, split: Split, log: RunLog) -> 
         return case
     _lift(case)
     return case
+
+
+def read_case(scene: SceneData, settings: Settings, split: Split, log: RunLog) -> Case:
+    """Views and Gaussians of a scene; nothing is lifted.
+
+    Raises:
+        InputError: They are missing or do not fit.
+    """
+    with log.stage("read"):
+        views = scene.need("views")()
+        lifted, scored = split(scene, views, settings)
+    gaussians = _gaussians(scene, settings, lifted, log)
+    return Case(scene, settings, gaussians, lifted, scored, log)
 
 
 def _lift(case: Case) -> None:

@@ -17,6 +17,8 @@ def reading(path: str | os.PathLike[str]) -> Iterator[None]:
 
     A pipe would be waited for without end, a device read without end: both are refused before the block.
     """
+    if "\0" in os.fspath(path):
+        raise InputError(f"{path}: no file can have this name; check the path")
     try:
         mode = os.stat(path).st_mode
         if not stat.S_ISREG(mode) and not stat.S_ISDIR(mode):

@@ -15,10 +15,10 @@ from numpy.typing import NDArray
 
 from sgwarp.errors import InputError
 from sgwarp.files.access import reading
+from sgwarp.files.archives import unpacked_limit
 from sgwarp.files.arrays import LONGEST_HEADER, read_header
 
 LOCAL_HEADER = 30  # bytes of a zip member's local header before its name
-MOST_DEFLATED = 1040  # a deflated byte never stands for more bytes than this
 CHUNK = 1 << 20  # skipped at once in a compressed member [bytes]
 
 
@@ -60,9 +60,10 @@ class StackedArray:
             )
         size = os.path.getsize(self.path)
         stored = self._member.compress_type == zipfile.ZIP_STORED
-        possible = size if stored else size * MOST_DEFLATED
-        if wanted > possible:
-            raise InputError(f"{self.path}: array '{self.name}' claims {wanted} bytes in a file of {size}")
+        if wanted > (size if stored else unpacked_limit(size)):
+            raise InputError(
+                f"{self.path}: array '{self.name}' claims {wanted} bytes in a file of {size}; store it uncompressed"
+            )
 
     @property
     def row_bytes(self) -> int:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import io
+import re
 import struct
 from array import array
 from collections.abc import Iterator
@@ -24,6 +25,8 @@ PARAMETER_COUNTS = {name: focals + 2 + count for name, (_, focals, count) in COL
 PARAMETER_COUNTS["EQUIRECTANGULAR"] = 2
 GREY = 128.0
 PLACES = ("sparse", "colmap/sparse", "dense/sparse", "dense/0/sparse", "distorted/sparse", ".")
+MOST_FIELDS = 32  # of a camera; more are one that is no number
+LONGEST_LINE = 1 << 24  # characters; an image with 20,000 observations has 500,000
 RECORD_BYTES = {"cameras": 24, "images": 73, "points3D": 43}  # the least of one record
 
 
@@ -238,7 +241,9 @@ def _lines(path: Path) -> Iterator[tuple[int, str]]:
     """Numbered lines without comments."""
     # Some editors put a mark at the start, which "utf-8-sig" takes off.
     text = io.TextIOWrapper(io.BytesIO(read_bytes(path)), "utf-8-sig", "replace")
-    for number, line in enumerate(text, start=1):
+    for number, line in enumerate(iter(lambda: text.readline(LONGEST_LINE), ""), start=1):
+        if len(line) == LONGEST_LINE:
+            raise InputError(f"{path}: line {number} has {LONGEST_LINE} characters or more; export the model again")
         if not line.lstrip().startswith("#"):
             yield number, line.strip()
 
@@ -246,7 +251,7 @@ def _lines(path: Path) -> Iterator[tuple[int, str]]:
 def _cameras_text(path: Path) -> Iterator[tuple[int, str, int, int, tuple[float, ...]]]:
     for number, line in _lines(path):
         if line:
-            fields = line.split()
+            fields = line.split(maxsplit=MOST_FIELDS)
             try:
                 camera_id, width, height = (_whole(fields[i]) for i in (0, 2, 3))
                 yield camera_id, fields[1], width, height, tuple(map(float, fields[4:]))
@@ -273,14 +278,14 @@ def _images_text(path: Path) -> Iterator[ImageRecord]:
 
 def _are_observations(line: str) -> bool:
     """Whether a line holds triplets X, Y, POINT3D_ID, and nothing but numbers."""
-    fields = line.split()
-    if len(fields) % 3:
-        return False
+    count = 0
     try:
-        list(map(float, fields))
+        for field in re.finditer(r"\S+", line):  # a list of all of them would take ten times the line
+            float(field[0])
+            count += 1
     except ValueError:
         return False
-    return True
+    return count % 3 == 0
 
 
 def _points_text(path: Path) -> Iterator[tuple[float, ...]]:

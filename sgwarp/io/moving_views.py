@@ -64,7 +64,7 @@ def load_moving_views(path: str | os.PathLike[str], split: Split = "train", phot
         InputError: Nothing of the kind is there, or what is there cannot be used.
     """
     path = Path(path)
-    meta = path if path.is_file() and path.name.endswith("meta.json") else path / f"{split}_meta.json"
+    meta = path if os.path.isfile(path) and path.name.endswith("meta.json") else path / f"{split}_meta.json"
     if meta.is_file():
         return MetaViews(meta, photographs)
     if path.is_dir() and not any((path / name).is_file() for name in TRANSFORMS) and find_model(path) is None:
@@ -110,7 +110,8 @@ class StillViews:
 
     def _find(self, stem: str, frame: int) -> Path | None:
         places = (self.folder / "images" / f"{frame:05d}", self.folder / f"{frame:05d}")
-        return next((p for place in places for s in IMAGE_SUFFIXES if (p := place / f"{stem}{s}").is_file()), None)
+        candidates = (place / f"{stem}{suffix}" for place in places for suffix in IMAGE_SUFFIXES)
+        return next(filter(os.path.isfile, candidates), None)
 
 
 class FolderViews:
@@ -177,7 +178,7 @@ class MetaViews:
                 raise InputError(f"{where}: is another view named '{stem}'; give every camera its own cam_id")
             seen.add(stem)
             image = self._images / file if file and self._photographs else None
-            there = image is not None and image.is_file()
+            there = image is not None and os.path.isfile(image)
             view = View(stem, self._camera(where, lens, pose), image if there else None)
             found.append(FrameView(view, file, image is not None and not there and self._images.is_dir()))
         return found

@@ -42,7 +42,7 @@ def load_points(path: str | os.PathLike[str], views: str | os.PathLike[str] | No
     Raises:
         InputError: There is no such file, or it holds no points.
     """
-    if not Path(path).exists():
+    if not os.path.exists(path):
         raise InputError(f"{path}: no such file or folder; check the path")
     source = find_points(path)
     if source is None:
@@ -110,7 +110,7 @@ def _named_in(transforms: Path) -> Path | None:
     if not isinstance(name, str):
         raise InputError(f"{transforms}: '{PLY_KEY}' must be the name of a file, got {name!r}")
     named = inside(transforms, transforms.parent, name)
-    if not named.is_file():
+    if not os.path.isfile(named):  # any name will do here, also one that is too long
         logging.getLogger("sgwarp").warning("%s: its '%s' %r does not exist", transforms, PLY_KEY, name)
         return None
     return named

@@ -62,7 +62,7 @@ def load_sequence(path: str | os.PathLike[str]) -> GaussianSequence:
         InputError: Nothing of the kind is there, or an array is missing or has the wrong shape.
     """
     path = Path(path)
-    if path.is_dir():
+    if os.path.isdir(path):
         params = path / "params.npz"
         if params.is_file():
             return ParamsSequence(params)
@@ -74,7 +74,7 @@ def load_sequence(path: str | os.PathLike[str]) -> GaussianSequence:
         return ParamsSequence(path)
     if path.suffix == ".ply":
         return PlySequence([path])
-    if not path.exists():
+    if not os.path.exists(path):
         raise InputError(f"{path}: no such file or folder; check the path")
     raise InputError(f"{path}: is no sequence; expected params.npz of Dynamic3DGaussians or a folder of .ply files")
 

@@ -30,9 +30,9 @@ def load_views(path: str | os.PathLike[str], image_folder: str | None = None, ph
         InputError: Nothing is found there, or what is found cannot be used.
     """
     path = Path(path)
-    if not path.exists():
+    if not os.path.exists(path):
         raise InputError(f"{path}: no such file or folder; check the path")
-    files = [path] if path.is_file() else [path / name for name in TRANSFORMS]
+    files = [path] if os.path.isfile(path) else [path / name for name in TRANSFORMS]
     transforms = next((file for file in files if file.is_file()), None)
     if transforms is not None:
         if image_folder is not None:

@@ -32,14 +32,19 @@ class Detections:
     def __init__(self) -> None:
         self._scores: list[Tensor] = []
         self._ious: list[Tensor] = []  # [P, T] of each image
+        self._outside: list[Tensor] = []  # share of each prediction that lies where nothing is scored, [P]
 
-    def add(self, predicted: Tensor, truth: Tensor, scores: Tensor | None = None) -> None:
+    def add(
+        self, predicted: Tensor, truth: Tensor, scores: Tensor | None = None, ignored: Tensor | None = None
+    ) -> None:
         """Add one image or scene.
 
         Args:
             predicted: Masks, bool [P, ...]; they may overlap.
             truth: Masks, bool [T, ...]; empty ones are left out.
             scores: How sure each prediction is, [P]; its size if None.
+            ignored: Where nothing is scored, bool [...]. A prediction that matches nothing and has a larger share there
+                than the threshold of IoU does not count, as in ScanNet's script.
 
         Raises:
             InputError: The masks differ in size, or there is not one score per prediction.
@@ -55,6 +60,8 @@ class Detections:
         shared = mine.float().double() @ theirs.float().double().T
         self._ious.append((shared / (sizes[:, None] + wanted[None] - shared).clamp(min=1.0)).cpu())
         self._scores.append(scores.cpu())
+        outside = torch.zeros_like(sizes) if ignored is None else (mine & ignored.flatten().bool()).sum(dim=1) / sizes
+        self._outside.append(outside.cpu())
 
     def average_precision(self, threshold: float) -> float:
         """Area under precision over recall at one IoU; NaN without true instances, 0 without predictions.
@@ -76,7 +83,8 @@ class Detections:
             matched = best >= 0 and float(overlap[best]) > threshold
             if matched:
                 free[image][best] = False
-            right.append(matched)
+            if matched or float(self._outside[image][row]) <= threshold:
+                right.append(matched)
         if not right:
             return 0.0
         correct = torch.tensor(right, dtype=torch.float64).cumsum(0)

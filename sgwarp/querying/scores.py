@@ -275,9 +275,13 @@ def _encode(semantics: Semantics, texts: Sequence[str], encoder: TextEncoder) ->
 
 
 def _cosines(semantics: Semantics, vectors: Tensor) -> Tensor:
+    """Cosines [N, Q]; raises InputError for features with NaN or infinity, which files of semantics never hold."""
     scores = vectors.new_empty(len(semantics), len(vectors))
     for start in range(0, len(semantics), CHUNK):
         rows = semantics.features[start : start + CHUNK].to(torch.float32)
         norm = rows.norm(dim=1, keepdim=True)
         scores[start : start + CHUNK] = (rows @ vectors.T) / torch.where(norm > 0, norm, 1.0)
+    if not scores.is_cuda and not bool(torch.isfinite(scores.sum())):  # on CUDA to look is to wait for the device
+        row = int((~torch.isfinite(scores)).any(dim=1).nonzero()[0])
+        raise InputError(f"features: of the semantics hold NaN or infinity, first in row {row}; lift the scene again")
     return scores

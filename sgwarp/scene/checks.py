@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from typing import Any
 
 import numpy as np
@@ -54,6 +55,18 @@ def float32(name: str, value: Any, shape: tuple[int | None, ...]) -> Tensor:
     wanted = ", ".join("any" if s is None else str(s) for s in shape)
     require(fits, f"{name}: expected shape [{wanted}], got {list(tensor.shape)}")
     return tensor.to(torch.float32).contiguous()
+
+
+def require_finite(name: str, value: Tensor | float) -> None:
+    """Refuse NaN and infinity in what places a whole image: a camera, a background, a setting.
+
+    A tensor on CUDA is not looked at, for that is to wait for the device.
+    """
+    if isinstance(value, Tensor):
+        fine = value.is_cuda or bool(torch.isfinite(value.detach()).all())
+    else:
+        fine = math.isfinite(value)
+    require(fine, f"{name}: holds NaN or infinity")
 
 
 def version_of(*tensors: Tensor) -> tuple[int, ...]:

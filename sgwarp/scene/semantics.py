@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 
 from sgwarp.errors import InputError
-from sgwarp.scene.checks import as_tensor, float32, require
+from sgwarp.scene.checks import as_tensor, float32, require, require_finite
 from sgwarp.scene.gaussians import Gaussians
 
 
@@ -42,6 +42,8 @@ class Semantics:
         n = len(features)
         put(self, "weight", float32("weight", self.weight, (n,)))
         put(self, "effective_views", float32("effective_views", self.effective_views, (n,)))
+        require_finite("weight", self.weight)
+        require_finite("effective_views", self.effective_views)
         require(bool(self.space), "space: must name the embedding space")
         if self.labels is not None:
             named, channels = len(self.labels), features.shape[1]

@@ -166,6 +166,7 @@ def in_rectangle(
     chosen = ahead & (x >= x0) & (x < x1 + 1) & (y >= y0) & (y < y1 + 1) & gaussians.finite
     if through or not bool(chosen.any()):
         return chosen
+    chosen &= gaussians.opacities > 0
     surface = rasterize(gaussians, camera, depth=True).depth
     assert surface is not None
     rows = chosen.nonzero().flatten()

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -31,20 +32,26 @@ SECONDS_PER_KEY = 1.5  # between two places of a camera path
 Progress = Callable[[int, int], None]
 
 
-def scene_file(bench: Workbench, plain: bool, only: Tensor | None = None) -> bytes:
-    """The scene as edited, as PLY.
+def scene_file(bench: Workbench, plain: bool, only: Tensor | None = None, moment: int = 0) -> bytes:
+    """The scene as edited, or a frame of a moving one, as PLY.
 
     Args:
         bench: Of the scene.
         plain: Leave out the columns that the loaded file has besides those of the reference implementation.
         only: Gaussians to save, bool [N]; all if None.
+        moment: Frame of a moving scene.
+
+    Raises:
+        InputError: The scene has changed since `only` was chosen.
     """
-    state = bench.state
+    scene = bench.scene(moment)
+    if only is not None and len(only) != len(scene.gaussians):
+        raise InputError("the selection is of an earlier state of the scene; select again")
     extras = None if plain else bench.session.original.extras
     if extras is not None:
-        rows = state.rows.cpu().numpy()
+        rows = scene.rows.cpu().numpy()
         extras = {name: column[rows] for name, column in extras.items()}
-    gaussians = replace(state.gaussians.to("cpu"), extras=extras)
+    gaussians = replace(scene.gaussians.to("cpu"), extras=extras)
     if only is not None:
         gaussians = gaussians.subset(only.cpu())
     return _written("scene.ply", lambda path: save_gaussians(gaussians, path))
@@ -162,8 +169,7 @@ def decode_picture(data: bytes) -> Picture:
     size = image_size(data)
     if size is not None and size[0] * size[1] > MOST_UPLOADED:
         raise InputError(f"picture: is {size[1]} x {size[0]}, more than {MOST_UPLOADED} pixels; make it smaller")
-    with TemporaryDirectory() as folder:
-        path = Path(folder) / "picture"
+    with _scratch("picture") as path:
         path.write_bytes(data)
         try:
             return read_rgb(path)
@@ -172,7 +178,21 @@ def decode_picture(data: bytes) -> Picture:
 
 
 def _written(name: str, write: Callable[[Path], None]) -> bytes:
-    with TemporaryDirectory() as folder:
-        path = Path(folder) / name
+    with _scratch(name) as path:
         write(path)
         return path.read_bytes()
+
+
+@contextmanager
+def _scratch(name: str) -> Iterator[Path]:
+    """A place for a temporary file.
+
+    Raises:
+        InputError: There is no room for it.
+    """
+    try:
+        with TemporaryDirectory() as folder:
+            yield Path(folder) / name
+    except OSError as error:
+        reason = error.strerror or str(error)
+        raise InputError(f"{name}: no temporary file can be written ({reason}); free some room or set TMPDIR") from None

@@ -126,6 +126,7 @@ class Allowance:
             "ViewerCameraMessage": _fits_camera,
             "ScenePointerMessage": _fits_pointer,
             "GuiUpdateMessage": _fits_update,
+            "CommandTriggerMessage": lambda message: isinstance(message.uuid, str) and len(message.uuid) <= MOST_TEXT,
             "FileTransferStartUpload": self._fits_start,
             "FileTransferPart": self._fits_part,
             "FileTransferPartAck": lambda message: True,

@@ -71,7 +71,9 @@ class Drawn:
 def draw(shot: Shot, camera: Camera) -> Drawn:
     """The picture of a shot as seen from a camera."""
     gaussians = shot.gaussians
-    background = torch.tensor(shot.background, dtype=torch.float32, device=gaussians.device)
+    background = None
+    if any(shot.background):
+        background = torch.tensor(shot.background, dtype=torch.float32, device=gaussians.device)
     seen = rasterize(gaussians, camera, background=background, depth=shot.depth or shot.mode == "depth")
     depth = None if seen.depth is None else seen.depth.cpu().numpy()
     if shot.mode == "depth":
@@ -98,7 +100,8 @@ def _colored(shot: Shot, camera: Camera, picture: Picture) -> Picture:
     means, enough = splat_scores(shot.gaussians, camera, shot.scores.values, shot.scores.seen)
     values = torch.where(enough[..., None], means, -torch.inf).cpu().numpy()
     if values.shape[2] == 1:
-        return heat_map(picture, np.where(enough.cpu().numpy(), values[..., 0], np.nan), low=0.0, high=1.0)
+        heated = heat_map(picture, np.where(enough.cpu().numpy(), values[..., 0], np.nan), low=0.0, high=1.0)
+        return np.where(_rim(values[..., 0] >= shot.threshold)[..., None], np.uint8(255), heated)
     return found_queries(picture, values, shot.colors, shot.threshold)
 
 
@@ -120,11 +123,16 @@ def found_queries(picture: Picture, values: NDArray[Any], colors: Picture, thres
 
 def _outlined(picture: Picture, gaussians: Gaussians, camera: Camera, selected: Tensor) -> Picture:
     """The picture with the selection tinted and a line around it."""
+    share = rasterize(gaussians, camera, selected.to(gaussians.device, torch.float32)[:, None]).features[..., 0]
+    inside = (share >= KNOWN_OPACITY).cpu().numpy()
+    color = np.array(HIGHLIGHT, dtype=np.float32)
+    tinted = np.where(inside[..., None], (1 - TINT) * picture + TINT * color, picture)
+    return np.asarray(np.where(_rim(inside)[..., None], color, tinted) + 0.5).astype(np.uint8)
+
+
+def _rim(inside: NDArray[np.bool_]) -> NDArray[np.bool_]:
+    """Pixels that touch a region from outside, [H, W]."""
     import cv2
 
-    share = rasterize(gaussians, camera, selected.to(gaussians.device, torch.float32)[:, None]).features[..., 0]
-    inside = (share >= KNOWN_OPACITY).cpu().numpy().astype(np.uint8)
-    rim = (cv2.dilate(inside, np.ones((3, 3), np.uint8)) > inside)[..., None]
-    color = np.array(HIGHLIGHT, dtype=np.float32)
-    tinted = np.where(inside[..., None] > 0, (1 - TINT) * picture + TINT * color, picture)
-    return np.asarray(np.where(rim, color, tinted) + 0.5).astype(np.uint8)
+    region = inside.astype(np.uint8)
+    return np.asarray(cv2.dilate(region, np.ones((3, 3), np.uint8)) > region)

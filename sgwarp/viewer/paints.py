@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Any
 
 import torch
 from torch import Tensor
@@ -84,8 +83,3 @@ def coverage_colors(gaussians: Gaussians, semantics: Semantics | None, views: Se
     share = ((count - 1.0) / (WELL_SEEN - 1.0)).clamp(0.0, 1.0)[:, None]
     paint = (1 - share) * torch.tensor((0.9, 0.15, 0.1)) + share * torch.tensor((0.1, 0.75, 0.2))
     return torch.where(count[:, None] > 0, paint, torch.tensor(NEVER))
-
-
-def legend(names: Sequence[str], colors: Any) -> list[tuple[str, str]]:
-    """Names with their colors as #rrggbb."""
-    return [(name, "#{:02x}{:02x}{:02x}".format(*map(int, color))) for name, color in zip(names, colors, strict=False)]

@@ -3,10 +3,10 @@ it."""
 
 from __future__ import annotations
 
-import html
+import contextlib
 import logging
 import threading
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from typing import Any
 
 import numpy as np
@@ -17,7 +17,9 @@ from sgwarp.errors import InputError
 from sgwarp.viewer import bounds
 from sgwarp.viewer.clicks import Found
 from sgwarp.viewer.downloads import picture_file, scene_file, script_file, video_file
+from sgwarp.viewer.markup import as_plain, legend_rows, notice, score_table, score_text
 from sgwarp.viewer.modes import MODES
+from sgwarp.viewer.playing import Player
 from sgwarp.viewer.questions import HIGH, LOW, OWN
 from sgwarp.viewer.tab import Tab
 
@@ -57,8 +59,10 @@ class Panel:
         self._client, self.tab, self._changed = client, tab, changed
         self._splats, self._aim, self._cameras = splats, aim, cameras
         self._typing: threading.Timer | None = None
+        self._player: Player | None = None
         self._closed = False
-        self._filling = False  # a control is set by the program, not by the user
+        self.doing = ""  # what takes a while
+        self.status = client.gui.add_markdown("")
         with client.gui.add_folder("Ask"):
             self._build_ask()
         with client.gui.add_folder("Show"):
@@ -67,13 +71,16 @@ class Panel:
             self._build_selection()
         with client.gui.add_folder("Save", expand_by_default=False):
             self._build_save()
-        self._status = client.gui.add_markdown("")
+        self._build_shortcuts()
+        self.refresh()
 
     def close(self) -> None:
         """Do nothing more: the tab is gone."""
         self._closed = True
         if self._typing is not None:
             self._typing.cancel()
+        if self._player is not None:
+            self._player.stop()
 
     # What the user is told
 
@@ -84,9 +91,20 @@ class Panel:
         self._client.add_notification(title, message[:500], auto_close_seconds=SHOWN, color=color)
 
     def set_status(self, text: str) -> None:
-        """The line at the bottom."""
-        if self._status.content != text:
-            self._status.content = text
+        """The line at the top; what takes a while goes before what is shown."""
+        text = f"{self.doing} ..." if self.doing else text
+        if self.status.content != text:
+            self.status.content = text
+
+    @contextlib.contextmanager
+    def _says(self, doing: str) -> Iterator[None]:
+        """Say what is done, as it may take a while."""
+        self.doing = doing
+        self.set_status("")
+        try:
+            yield
+        finally:
+            self.doing = ""
 
     def _try(self, work: Callable[[], Any], redraw: bool = True) -> Any:
         """Do what a control asks for; a value that is refused changes nothing, whatever fails is told."""
@@ -96,22 +114,23 @@ class Panel:
             result = work()
         except InputError as error:
             self.tell(str(error), wrong=True)
+            self.refresh()  # the control shows what was refused
             return None
         except Exception as error:  # a fault of one tab must not end the program
             logger.exception("viewer: a control failed")
             self.tell(f"{type(error).__name__}: {error}", wrong=True)
             return None
         if redraw:
-            self._refresh()
+            self.refresh()
             self._changed()
         return result
 
     def _on(self, handle: Any, work: Callable[[Any], Any], redraw: bool = True) -> Any:
-        """Have a control's new value taken."""
+        """Have a control's new value taken, if it comes from the page."""
 
         @handle.on_update
         def _(event: Any) -> None:
-            if not self._filling:
+            if event.client is not None:
                 self._try(lambda: work(handle.value), redraw)
 
         return handle
@@ -141,12 +160,14 @@ class Panel:
             self._on(box, lambda value: self._ask_soon(), redraw=False)
         self._threshold = gui.add_slider("Threshold", LOW, HIGH, 0.01, 0.5, hint=HINTS["threshold"])
         self._on(self._threshold, self.tab.set_threshold)
-        empty = np.zeros(2), np.zeros(2)
+        empty = np.zeros(2), np.zeros(2), np.zeros(2)
         self._histogram = gui.add_uplot(
             empty,
-            ({"label": "score"}, {"label": "Gaussians", "stroke": "#e8590c", "fill": "#ffd8a8"}),
+            ({"label": "score"}, {"stroke": "#868e96", "fill": "#ced4da"}, {"stroke": "#e8590c", "fill": "#ffa94d"}),
             scales={"x": {"time": False, "range": (LOW, HIGH)}},
+            axes=({"stroke": "#adb5bd"}, {"show": False}),  # logarithms; only their shape says something
             legend={"show": False},
+            padding=(8, 16, 0, 16),
             height=110,
             visible=False,
         )
@@ -169,7 +190,10 @@ class Panel:
         self._typing.start()
 
     def _ask(self) -> None:
-        answers = self.tab.ask(self._query.value, self._negatives.value, self._templates.value, self._ensemble.value)
+        with self._says("Asking"):
+            answers = self.tab.ask(
+                self._query.value, self._negatives.value, self._templates.value, self._ensemble.value
+            )
         if answers is not None and answers.unknown:
             names = ", ".join(answers.unknown)
             self.tell(f"the encoder knows nothing like {names}; choose other words", wrong=True)
@@ -194,20 +218,38 @@ class Panel:
         if instances is not None and len(instances.levels) > 1:
             levels = tuple(instances.levels)
             self._on(gui.add_dropdown("Level", levels, initial_value=levels[-1]), self.tab.set_level)
-        self._on(gui.add_slider("Strength", 0.0, 1.0, 0.01, look.strength), self.tab.set_strength)
+        self._strength = self._on(gui.add_slider("Strength", 0.0, 1.0, 0.01, look.strength), self.tab.set_strength)
         if bench.frames > 1:
-            time = gui.add_slider("Time", 0, bench.frames - 1, 1, 0)
-            self._on(time, self.tab.set_moment)
+            self._time = self._on(gui.add_slider("Time", 0, bench.frames - 1, 1, 0), self.tab.set_moment)
+            self._on(gui.add_checkbox("Play", False), self._play, redraw=False)
         self._on(gui.add_rgb("Background", (0, 0, 0)), self.tab.set_background)
         if bench.materials.views:
             stems = ("-", *(view.stem for view in bench.materials.views))
             self._on(gui.add_dropdown("Look from", stems), lambda stem: stem == "-" or self._aim(stem), redraw=False)
             self._on(gui.add_checkbox("Cameras of the views", False), self._show_cameras)
-        self._on(gui.add_checkbox("Splats in the browser", False), lambda value: self._splats(bool(value)))
+        self._button("Reset view", lambda: self._aim(""), "Look from where the page began (R).", redraw=False)
+        self._drawn_there = self._on(gui.add_checkbox("Splats in the browser", False), self._draw_splats)
 
     def _show_cameras(self, wanted: bool) -> None:
         self._cameras(bool(wanted))
         self.tab.set_cameras(wanted)
+
+    def _draw_splats(self, wanted: bool) -> None:
+        try:
+            self._splats(bool(wanted))
+        except InputError:
+            self._drawn_there.value = False
+            raise
+
+    def _play(self, wanted: bool) -> None:
+        if self._player is not None:
+            self._player.stop()
+        self._player = Player(self._next_frame) if wanted else None
+
+    def _next_frame(self) -> None:
+        moment = self.tab.advance()
+        self._time.value = moment
+        self._changed()
 
     # Selection
 
@@ -221,18 +263,51 @@ class Panel:
         )
         reach = gui.add_number("Grow by", 0.05, step=0.01, hint="Negative numbers shrink the selection.")
         self._button("Grow", lambda: self.tab.grow_selection(reach.value))
+        self._build_box()
         self._button("Hide", lambda: self._edit(ops.Fade(0.0)), "Opacity 0; undo shows it again.")
         self._button("Isolate", lambda: self._edit(ops.Isolate(0.05)), "Fade everything else.")
-        self._button("Delete", lambda: self._edit(ops.Remove()))
+        self._button("Delete", lambda: self._edit(ops.Remove()), "Also by Shift+D.")
         self._button("Keep only this", lambda: self._edit(ops.Extract()))
         color = gui.add_rgb("Color", (230, 60, 40))
         self._button("Recolor", lambda: self._edit(ops.Recolor(_color(color.value))))
         shift = gui.add_vector3("Shift", (0.0, 0.0, 0.0), step=0.01)
         self._button("Move", lambda: self._edit(ops.Move(_shift(shift.value))))
         self._button("Duplicate", lambda: self._edit(ops.Duplicate(_shift(shift.value))))
-        self._button("Undo", lambda: self.tell(self.tab.bench.undo()))
-        self._button("Redo", lambda: self.tell(self.tab.bench.redo()))
-        self._button("Select nothing", self.tab.clear_selection)
+        self._button("Undo", self._undo, "Also by Ctrl+Z.")
+        self._button("Redo", self._redo, "Also by Ctrl+Shift+Z.")
+        self._button("Select nothing", self.tab.clear_selection, "Also by N.")
+
+    def _build_box(self) -> None:
+        """Two corners, those of the scene without its outermost hundredth at first."""
+        gui = self._client.gui
+        low, high = self.tab.bench.extent()
+        with gui.add_folder("Box", expand_by_default=False):
+            first, second = gui.add_vector3("From", low, step=0.01), gui.add_vector3("To", high, step=0.01)
+            self._button(
+                "Select box",
+                lambda: self._tell_found(self.tab.select_box(first.value, second.value)),
+                "What lies between two corners; Keep only this then crops the scene.",
+            )
+
+    def _build_shortcuts(self) -> None:
+        """Keys, and the same words in the palette of commands (Ctrl+K)."""
+        commands: tuple[tuple[str, str, str | None, Callable[[], Any]], ...] = (
+            ("Undo", "Z", "cmd/ctrl", self._undo),
+            ("Redo", "Z", "cmd/ctrl+shift", self._redo),
+            ("Delete the selection", "D", "shift", lambda: self._edit(ops.Remove())),
+            ("Hide the selection", "H", None, lambda: self._edit(ops.Fade(0.0))),
+            ("Select nothing", "N", None, self.tab.clear_selection),
+            ("Reset view", "R", None, lambda: self._aim("")),
+        )
+        for label, key, modifier, work in commands:
+            handle = self._client.gui.add_command(label, hotkey=key, modifier=modifier)
+            handle.on_trigger(lambda event, work=work: self._try(work))
+
+    def _undo(self) -> None:
+        self.tell(self.tab.bench.undo())
+
+    def _redo(self) -> None:
+        self.tell(self.tab.bench.redo())
 
     def _edit(self, operation: ops.Operation) -> None:
         self.tell(self.tab.edit(operation))
@@ -260,10 +335,12 @@ class Panel:
         def save_scene() -> None:
             only = None
             if chosen.value:
-                if tab.found is None:
+                found = tab.found
+                if found is None:
                     raise InputError("nothing is selected")
-                only = tab.found.selected
-            self._send("scene.ply", scene_file(tab.bench, not columns.value, only))
+                only = found.selected
+            with self._says("Writing the scene"):
+                self._send("scene.ply", scene_file(tab.bench, not columns.value, only, tab.look.moment))
 
         self._button("Scene (PLY)", save_scene, redraw=False)
         self._button(
@@ -282,40 +359,45 @@ class Panel:
             self._send("picture.png", picture_file(self.tab.shot(), self.tab.camera))
 
     def _save_video(self) -> None:
-        self._send("path.mp4", video_file(self.tab.shot(), self.tab.keys))
+        def progress(done: int, total: int) -> None:
+            if self._closed:
+                raise InputError("the tab was closed")
+            self.doing = f"Drawing picture {done} of {total}"
+
+        with self._says("Drawing the video"):
+            self._send("path.mp4", video_file(self.tab.shot(), self.tab.keys, progress))
 
     def _send(self, name: str, content: bytes) -> None:
         self._client.send_file_download(name, content, save_immediately=True)
 
     # What the tab says
 
-    def _refresh(self) -> None:
+    def refresh(self) -> None:
         """Bring the controls up to date with the tab."""
-        tab = self.tab
-        self._filling = True
-        try:
-            if self._mode.value != tab.look.mode:
-                self._mode.value = tab.look.mode
-            self._info.content = NOTHING if tab.found is None else _plain(tab.found.sentence)
-            self._legend.content = _legend(tab.legend()) + self._refresh_answers()
-        finally:
-            self._filling = False
+        tab, found = self.tab, self.tab.found
+        self._mode.value = tab.look.mode
+        self._strength.visible = tab.look.mode in ("features", "instances")  # the modes that it changes
+        self._info.content = NOTHING if found is None else as_plain(found.sentence)
+        self._legend.content = legend_rows(tab.legend()) + notice(tab.missing) + self._refresh_answers()
 
     def _refresh_answers(self) -> str:
         """Histogram and best objects; these also as HTML."""
         answers = self.tab.answers
-        self._histogram.visible = answers is not None
-        if answers is None:
+        first = None if answers is None else answers.first
+        self._histogram.visible = first is not None
+        if answers is None or first is None:
             self._top.visible = False
             return ""
-        centers, counts = answers.histogram()
-        self._histogram.data = (centers.numpy(), np.log10(1.0 + counts.numpy()))
-        ranked = answers.rank(self.tab.bench.materials.instances)
+        centers, counts = answers.histogram(first)
+        heights = np.log10(1.0 + counts.numpy())
+        reached = centers.numpy() >= self.tab.look.threshold
+        self._histogram.data = (centers.numpy(), heights, np.where(reached, heights, 0.0))
+        ranked = answers.rank(self.tab.bench.materials.instances, first)
         self._top.visible = bool(ranked)
-        options = ("-", *(f"{one.id} {one.name} {one.score:.2f}" for one in ranked))
+        options = ("-", *(f"{one.id} {one.name} {score_text(one.score)}" for one in ranked))
         if tuple(self._top.options) != options:
             self._top.options = options
-        return _table([(one.name, one.score) for one in ranked[:LISTED]])
+        return score_table([(one.name, one.score) for one in ranked[:LISTED]])
 
 
 def _color(values: Any) -> ops.Vector:
@@ -326,27 +408,3 @@ def _color(values: Any) -> ops.Vector:
 def _shift(values: Any) -> ops.Vector:
     x, y, z = bounds.numbers("shift", values, 3, bounds.FAR_AWAY)
     return x, y, z
-
-
-def _legend(rows: list[tuple[str, str]]) -> str:
-    lines = [
-        f'<div><span style="display:inline-block;width:0.9em;height:0.9em;background:{color};margin-right:0.5em">'
-        f"</span>{html.escape(name)}</div>"
-        for name, color in rows[:32]
-    ]
-    return f'<div style="padding:0 1em;font-size:0.85em">{"".join(lines)}</div>' if lines else ""
-
-
-def _table(rows: list[tuple[str, float]]) -> str:
-    """Names with scores, and a bar of each score."""
-    lines = [
-        f'<tr><td>{html.escape(name)}</td><td style="width:40%"><div style="height:0.6em;background:#e8590c;'
-        f'width:{100 * min(max(score, 0.0), 1.0):.0f}%"></div></td><td>{score:.2f}</td></tr>'
-        for name, score in rows
-    ]
-    return f'<table style="margin:0.3em 1em;width:90%;font-size:0.85em">{"".join(lines)}</table>' if lines else ""
-
-
-def _plain(text: str) -> str:
-    """Text that Markdown shows as it is."""
-    return "".join(f"\\{letter}" if letter in "\\`*_{}[]<>()#+!|~" else letter for letter in text)

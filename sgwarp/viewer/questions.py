@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field, fields, replace
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -91,6 +92,12 @@ class Answers:
         known = self.scores.known.tolist()
         return tuple(text for text, means in zip(self.questions.queries, known, strict=True) if not means)
 
+    @property
+    def first(self) -> int | None:
+        """The first query that means something to the encoder; histogram and list are about it. None if none does."""
+        known = self.scores.known.nonzero().flatten().tolist()
+        return known[0] if known else None
+
     def histogram(self, query: int = 0) -> tuple[Tensor, Tensor]:
         """How many seen Gaussians score how much: centers of the bins, float64 [40], and counts, float64 [40]."""
         known = self.scores.values[self.scores.seen, query].double().cpu().clamp(LOW, HIGH)
@@ -123,12 +130,15 @@ class Asker:
         encoder: Text encoder of their space; None for lifted labels.
         predicted: By the network, or None.
         with_templates: Makes the text encoder for other templates, or None if there are none but its own.
+        make_tower: Makes what encodes images in that space, where the text encoder does not; None if nothing does.
     """
 
     semantics: Semantics | None
     encoder: TextEncoder | None = None
     predicted: Semantics | None = None
     with_templates: Callable[[str], TextEncoder] | None = None
+    make_tower: Callable[[], Any] | None = None
+    _tower: Any = field(default=None, repr=False)
     _encoders: dict[str, TextEncoder] = field(default_factory=dict)
 
     def ask(self, questions: Questions, pictures: Mapping[str, Tensor] | None = None) -> Answers:
@@ -147,7 +157,7 @@ class Asker:
             raise InputError("query: is empty; write what to look for, such as couch; lamp")
         encoder = self._encoder(questions.templates)
         if encoder is not None and pictures:
-            encoder = WithPictures(encoder, pictures, encoder.space, calibration_of(encoder))
+            encoder = WithPictures(encoder, pictures, encoder.space, _with_names(calibration_of(encoder), pictures))
         options = {"measure": "relevancy", "canonical": questions.negatives} if questions.negatives else {}
         scores = score_texts(
             self.semantics,
@@ -157,7 +167,9 @@ class Asker:
             ensemble=questions.ensemble,
             **options,  # type: ignore[arg-type]
         )
-        return Answers(questions, scores)
+        # The values of a phrase without meaning are noise that `rescale` has blown up.
+        values = torch.where(scores.known.to(scores.values.device), scores.values, 0.0)
+        return Answers(questions, replace(scores, values=values))
 
     def _encoder(self, templates: str) -> TextEncoder | None:
         if self.encoder is None or templates == OWN or self.with_templates is None:
@@ -169,7 +181,7 @@ class Asker:
     @property
     def sees_pictures(self) -> bool:
         """Whether a picture can be asked for: the encoder has an image tower."""
-        return callable(getattr(self.encoder, "encode_images", None))
+        return callable(getattr(self.encoder, "encode_images", None)) or self.make_tower is not None
 
     def picture_vector(self, image: Picture) -> Tensor:
         """Unit vector of a picture in the space of the semantics, float32 [C].
@@ -179,7 +191,10 @@ class Asker:
         """
         import cv2
 
-        encode, side = getattr(self.encoder, "encode_images", None), getattr(self.encoder, "side", 224)
+        if self._tower is None:
+            own = callable(getattr(self.encoder, "encode_images", None)) or self.make_tower is None
+            self._tower = self.encoder if own else self.make_tower()  # type: ignore[misc]
+        encode, side = getattr(self._tower, "encode_images", None), getattr(self._tower, "side", 224)
         if not callable(encode):
             raise InputError("picture: the encoder of these semantics has no image tower; ask in words")
         edge = min(image.shape[:2])
@@ -188,6 +203,22 @@ class Asker:
         resized = cv2.resize(square, (side, side), interpolation=cv2.INTER_AREA)
         vector: Tensor = encode(torch.from_numpy(resized)[None])[0]
         return torch.nn.functional.normalize(vector.to("cpu", torch.float32), dim=0)
+
+
+@dataclass(frozen=True)
+class _PicturesKnown(Calibration):
+    """A calibration for which the names of pictures mean something."""
+
+    names: frozenset[str] = frozenset()
+
+    def known(self, texts: Sequence[str]) -> Tensor:
+        """Texts that mean something to the encoder, and names of pictures, bool [Q]."""
+        return super().known(texts) | torch.tensor([text in self.names for text in texts], dtype=torch.bool)
+
+
+def _with_names(calibration: Calibration, pictures: Mapping[str, Tensor]) -> Calibration:
+    own = {one.name: getattr(calibration, one.name) for one in fields(Calibration)}
+    return _PicturesKnown(**own, names=frozenset(pictures))
 
 
 @dataclass

@@ -72,9 +72,10 @@ class Canvas:
         parts = (splats.centers, splats.covariances, splats.rgbs, splats.opacities)
         if self._splats is None:
             self._splats = self._client.scene.add_gaussian_splats(SPLATS, *parts)
-            self._client.scene.set_background_image(None)
         else:
             self._splats.set_gaussians(*parts)
+        behind = np.array([[shot.background]])  # one pixel, behind the splats
+        self._client.scene.set_background_image((255 * behind + 0.5).astype(np.uint8), format="png")
 
     def remove_splats(self) -> None:
         """Go back to pictures."""

@@ -98,9 +98,10 @@ class Viewer:
         first = self._views[0].camera
         ups = torch.stack([-view.camera.world_to_camera[1, :3] for view in self._views]).mean(dim=0)
         up = ups / ups.norm() if float(ups.norm()) > 1e-6 else -first.world_to_camera[1, :3]
-        scene.set_up_direction(tuple(up.tolist()))
+        self.up: tuple[float, float, float] = tuple(up.tolist())
+        scene.set_up_direction(self.up)
         start = self.server.initial_camera
-        start.up = tuple(up.tolist())
+        start.up = self.up
         start.position = tuple(first.position.tolist())
         start.look_at = tuple(self._target(self._views[0]).tolist())
         start.fov = _fov(self._views[0])
@@ -149,6 +150,7 @@ class Viewer:
         self.streamer.change()
         for session in self.tabs:
             session.follow()
+            session.panel.refresh()
 
     def _report(self) -> None:
         while not self._ended.wait(STATUS_EVERY):
@@ -247,14 +249,17 @@ class Session:
         self.stream.paused = wanted
 
     def aim(self, stem: str) -> None:
-        """Look from a view."""
-        view = next((view for view in self.viewer.bench.materials.views if view.stem == stem), None)
+        """Look from a view, or if it has no name from where the page began."""
+        viewer = self.viewer
+        known = viewer.bench.materials.views if stem else viewer._views[:1]
+        view = next((view for view in known if view.stem == stem or not stem), None)
         if view is None:
             raise InputError(f"view '{stem[:40]}': there is no such view")
+        up = tuple((-view.camera.world_to_camera[1, :3]).tolist()) if stem else viewer.up
         with self.client.atomic():
-            self.client.camera.up_direction = tuple((-view.camera.world_to_camera[1, :3]).tolist())
+            self.client.camera.up_direction = up
             self.client.camera.position = tuple(view.camera.position.tolist())
-            self.client.camera.look_at = tuple(self.viewer._target(view).tolist())
+            self.client.camera.look_at = tuple(viewer._target(view).tolist())
             self.client.camera.fov = _fov(view)
 
     def show_cameras(self, wanted: bool) -> None:
@@ -286,13 +291,14 @@ class Session:
         )
 
     def report(self) -> None:
-        """The line at the bottom of the panel."""
+        """The line at the top of the panel."""
+        count = f"{len(self.viewer.bench.scene(self.tab.look.moment).gaussians):,} Gaussians"
         if self.stream.paused:
-            self.panel.set_status("The browser draws splats, without harmonics.")
+            self.panel.set_status(f"{count}, drawn by the browser without harmonics")
             return
         height, width = self.canvas.size
         state = {"moving": f"{self.canvas.rate:.0f} pictures/s", "still": "drawing", "done": "still"}
-        self.panel.set_status(f"{width} x {height}, {state[self.stream.state]}")
+        self.panel.set_status(f"{count}, {width} x {height}, {state[self.stream.state]}")
 
 
 def _fov(view: View) -> float:

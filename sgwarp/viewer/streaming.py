@@ -9,6 +9,8 @@ from collections.abc import Callable
 from dataclasses import dataclass, field
 from typing import Literal, Protocol
 
+import torch
+
 from sgwarp.errors import InputError
 from sgwarp.ops.launcher import Interrupted, interruptible
 from sgwarp.scene import Camera
@@ -39,6 +41,19 @@ class Screen(Protocol):
 
 
 State = Literal["moving", "still", "done"]
+
+
+def compute_alone() -> None:
+    """Have torch compute in the calling thread alone, as long as it lives.
+
+    Its workers wait for the next operation by spinning. A picture has dozens of short operations, so spinning took as
+    much processor time as the picture itself, and the browser and the rasterizer's own threads want the same cores.
+    """
+    others = torch.get_num_threads()
+    torch.set_num_threads(1)  # of this thread and, if nobody says otherwise, of all that begin later
+    restore = threading.Thread(target=torch.set_num_threads, args=(others,))
+    restore.start()
+    restore.join()
 
 
 @dataclass(eq=False)
@@ -125,6 +140,7 @@ class Streamer:
         self._wake.notify_all()
 
     def _work(self) -> None:
+        compute_alone()
         while True:
             with self._wake:
                 chosen, wait = self._next()

@@ -6,6 +6,7 @@ import threading
 from dataclasses import dataclass, replace
 from typing import Any
 
+import torch
 from torch import Tensor
 
 from sgwarp.apps.editing.operations import Operation
@@ -13,16 +14,16 @@ from sgwarp.apps.editing.picker import grow
 from sgwarp.errors import InputError
 from sgwarp.querying.scoring import TextScores
 from sgwarp.scene import Camera
-from sgwarp.viewer import bounds, clicks, paints
+from sgwarp.viewer import bounds, clicks, legends, paints
 from sgwarp.viewer.clicks import Found
 from sgwarp.viewer.downloads import decode_picture
 from sgwarp.viewer.modes import MODES, PAINTED, Mode, Shot
 from sgwarp.viewer.questions import HIGH, LOW, PICTURE, Answers, Questions
 from sgwarp.viewer.workbench import Scene, Workbench
-from sgwarp.visualization.pictures import class_colours
 
 MOST_PICTURES = 8  # that a tab may ask for
 MOST_KEYS = 64  # of a camera path
+NOTHING = "nothing is selected; click at an object or draw a rectangle"
 
 
 @dataclass(frozen=True)
@@ -50,6 +51,33 @@ class Look:
     cameras: bool = False
 
 
+@dataclass(frozen=True, eq=False)
+class _Selected:
+    """What is selected, known by where its Gaussians come from, so that it outlives edits and the time slider.
+
+    Attributes:
+        found: In the scene of that revision.
+        keys: Of its Gaussians, int64.
+        revision: Of the scene.
+    """
+
+    found: Found
+    keys: Tensor
+    revision: int
+
+    def carried(self, scene: Scene) -> _Selected:
+        """The same in another state of the scene, or in another frame."""
+        if scene.revision == self.revision:
+            return self
+        selected = torch.isin(_keys(scene), self.keys.to(scene.rows.device))
+        return _Selected(replace(self.found, selected=selected), self.keys, scene.revision)
+
+
+def _keys(scene: Scene) -> Tensor:
+    """A number for every Gaussian that stays its own: its row in the scene as loaded, and which copy of it it is."""
+    return scene.rows + (scene.copies.to(torch.int64) << 32)
+
+
 class Tab:
     """The state of one tab; every method may be called from any thread.
 
@@ -63,12 +91,11 @@ class Tab:
         self.bench = bench
         self.look = Look()
         self.answers: Answers | None = None
-        self.found: Found | None = None
         self.camera: Camera | None = None
         self.keys: list[Camera] = []
         self._pictures: dict[str, Tensor] = {}
         self._lock = threading.RLock()
-        self._selected_at = -1  # revision of the scene that `found` belongs to
+        self._selected: _Selected | None = None
         self._carried: tuple[Any, TextScores] | None = None
         self._paints: dict[tuple[str, str, int], tuple[Tensor, Tensor | None]] = {}
 
@@ -102,6 +129,12 @@ class Tab:
     def set_moment(self, value: Any) -> None:
         """Frame of a moving scene."""
         self._look(moment=bounds.whole("time", value, 0, self.bench.frames - 1))
+
+    def advance(self) -> int:
+        """Go to the next frame of a moving scene, from the last one to the first; returns it."""
+        with self._lock:
+            self._look(moment=(self.look.moment + 1) % self.bench.frames)
+            return self.look.moment
 
     def set_level(self, value: Any) -> None:
         """Level of the instances."""
@@ -161,14 +194,25 @@ class Tab:
 
     # What to select
 
+    @property
+    def found(self) -> Found | None:
+        """What is selected, in the scene as it is now; None if nothing is, or if all of it was deleted."""
+        return self._found_in(self.bench.scene(self.look.moment))
+
+    def _found_in(self, scene: Scene) -> Found | None:
+        with self._lock:
+            if self._selected is not None:
+                self._selected = self._selected.carried(scene)
+            there = self._selected is not None and bool(self._selected.found.selected.any())
+            return self._selected.found if self._selected is not None and there else None
+
     def click(self, position: Any) -> Found:
         """Select the object at a place of the picture, from 0 to 1 on either side; again: its part there."""
         camera = self._require_camera()
         pixel = bounds.pixel(position, camera)
         scene, context = self.bench.scene(self.look.moment), self.bench.session.context
-        before = self.found if self._selected_at == scene.revision else None
-        found = clicks.click(scene.state, context, self.bench.asker, camera, pixel, before)
-        self._select(found, scene.revision)
+        found = clicks.click(scene.state, context, self.bench.asker, camera, pixel, self._found_in(scene))
+        self._select(found, scene)
         return found
 
     def select_rectangle(self, first: Any, second: Any) -> Found:
@@ -177,7 +221,7 @@ class Tab:
         corners = bounds.pixel(first, camera), bounds.pixel(second, camera)
         scene = self.bench.scene(self.look.moment)
         found = Found(clicks.in_rectangle(scene.state, camera, corners, self.look.through))
-        self._select(found, scene.revision)
+        self._select(found, scene)
         return found
 
     def select_found(self, query: Any = 0) -> Found:
@@ -185,10 +229,13 @@ class Tab:
         if self.answers is None:
             raise InputError("nothing was asked; write a query first")
         query = bounds.whole("query", query, 0, len(self.answers.questions.queries) - 1)
+        name = self.answers.questions.queries[query]
+        if name in self.answers.unknown:
+            raise InputError(f"query: the encoder knows nothing like {name}, so nothing was found")
         scene = self.bench.scene(self.look.moment)
         scores = self.answers.carried(scene.rows)
         found = Found((scores.values[:, query] > self.look.threshold) & scores.seen)
-        self._select(found, scene.revision)
+        self._select(found, scene)
         return found
 
     def select_instance(self, number: Any) -> Found:
@@ -200,31 +247,41 @@ class Tab:
         scene = self.bench.scene(self.look.moment)
         chosen = instances.members(number)[scene.rows]
         level = instances.table[number - 1].level
-        self._select(clicks.describe(scene.state, self.bench.asker, instances, chosen, level), scene.revision)
-        assert self.found is not None
-        return self.found
+        return self._select(clicks.describe(scene.state, self.bench.asker, instances, chosen, level), scene)
+
+    def select_box(self, low: Any, high: Any) -> Found:
+        """Select the Gaussians whose centers lie between two corners [scene units]."""
+        first, second = (
+            bounds.numbers(name, corner, 3, bounds.FAR_AWAY) for name, corner in (("from", low), ("to", high))
+        )
+        scene = self.bench.scene(self.look.moment)
+        means = scene.gaussians.means.double()
+        corners = torch.tensor([first, second], dtype=torch.float64, device=means.device)
+        inside = ((means >= corners.amin(dim=0)) & (means <= corners.amax(dim=0))).all(dim=1)
+        return self._select(Found(inside & scene.gaussians.finite), scene)
 
     def grow_selection(self, distance: Any) -> Found:
         """Add what lies within a distance of the selection, or if negative take away what lies within it of the rest
         [scene units]."""
         distance = bounds.number("distance", distance, -bounds.FAR_AWAY, bounds.FAR_AWAY)
         scene = self.bench.scene(self.look.moment)
-        if self.found is None or self._selected_at != scene.revision:
-            raise InputError("nothing is selected; click at an object or draw a rectangle")
-        chosen = self.found.selected if not distance else grow(scene.gaussians.means, self.found.selected, distance)
+        found = self._found_in(scene)
+        if found is None:
+            raise InputError(NOTHING)
+        chosen = found.selected if not distance else grow(scene.gaussians.means, found.selected, distance)
         if not bool(chosen.any()):
             raise InputError(f"distance: {distance:g} would leave nothing selected")
-        self._select(Found(chosen), scene.revision)
-        assert self.found is not None
-        return self.found
+        return self._select(Found(chosen), scene)
 
     def clear_selection(self) -> None:
         """Select nothing."""
-        self._select(None, -1)
-
-    def _select(self, found: Found | None, revision: int) -> None:
         with self._lock:
-            self.found, self._selected_at = found, revision
+            self._selected = None
+
+    def _select(self, found: Found, scene: Scene) -> Found:
+        with self._lock:
+            self._selected = _Selected(found, _keys(scene)[found.selected], scene.revision)
+        return found
 
     def _require_camera(self) -> Camera:
         if self.camera is None:
@@ -234,25 +291,25 @@ class Tab:
     # What to do with it
 
     def edit(self, operation: Operation) -> str:
-        """Apply an operation to the selection, for all tabs; says what was done. What is moved or recolored stays
-        selected."""
+        """Apply an operation to the selection, for all tabs; says what was done. What is left of it stays selected."""
+        self.bench.require_still(operation)
         with self._lock:
+            found = self.found
+            if found is None:
+                raise InputError(NOTHING)
+            self.bench.apply(self.bench.term_of(found.selected, found.instance), operation)
             if self.found is None:
-                raise InputError("nothing is selected; click at an object or draw a rectangle")
-            term = self.bench.term_of(self.found.selected, self.found.instance)
-            done = self.bench.apply(term, operation)
-            scene = self.bench.scene(self.look.moment)
-            stays = len(scene.gaussians) == len(self.found.selected)
-            self._select(self.found if stays else None, scene.revision)
-        return done
+                self.clear_selection()  # so that an undo shows the scene as it was
+        return f"{operation.name}: {int(found.selected.sum()):,} Gaussians; {len(self.bench.state.gaussians):,} in all"
 
     # The picture
 
     def shot(self) -> Shot:
         """Everything that the next picture depends on but the camera."""
         with self._lock:
-            look, answers, found = self.look, self.answers, self.found
+            look, answers = self.look, self.answers
         scene = self.bench.scene(look.moment)
+        found = self._found_in(scene)
         shot = Shot(
             scene.gaussians,
             look.mode,
@@ -260,7 +317,7 @@ class Tab:
             threshold=look.threshold,
             depth=look.cameras,
         )
-        if found is not None and self._selected_at == scene.revision:
+        if found is not None:
             shot = replace(shot, selected=found.selected)
         if look.mode in PAINTED:
             paint, known = self._paint(look, scene)
@@ -310,13 +367,12 @@ class Tab:
 
     def legend(self) -> list[tuple[str, str]]:
         """Names and colors of what the picture shows, #rrggbb."""
-        if self.look.mode in ("relevancy", "segmentation") and self.answers is not None:
-            names = self.answers.questions.queries
-            return paints.legend(names, class_colours(len(names)))
-        if self.look.mode == "coverage":
-            colors = ((255, 0, 255), (230, 38, 26), (26, 191, 51))
-            return paints.legend(("no view", "one view", "8 views or more"), colors)
-        return []
+        return legends.legend(self.look.mode, self.answers, self.bench.materials.instances, self.look.level)
+
+    @property
+    def missing(self) -> str:
+        """What to do so that the mode shows something; empty if nothing is missing."""
+        return legends.missing(self.look.mode, self.answers)
 
     # A camera path
 

@@ -6,6 +6,7 @@ import threading
 from collections import OrderedDict
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -39,6 +40,7 @@ class Materials:
         instances: Or None.
         views: Cameras to start from, and to tell what was looked at.
         sequence: The frames of a moving scene, or None.
+        make_tower: Makes what encodes images in the semantics' space, if the text encoder does not; or None.
     """
 
     gaussians: Gaussians
@@ -49,6 +51,7 @@ class Materials:
     instances: InstanceMap | None = None
     views: Sequence[View] = ()
     sequence: GaussianSequence | None = None
+    make_tower: Callable[[], Any] | None = None
 
 
 @dataclass(frozen=True, eq=False)
@@ -91,12 +94,13 @@ class Workbench:
         self._listeners: list[Callable[[], None]] = []
         self._frames: OrderedDict[int, Gaussians] = OrderedDict()
         self._revision = 0
+        self._range: tuple[Materials, tuple[float, float]] | None = None
         self._begin(given)
 
     def _begin(self, given: Materials) -> None:
         context = EditContext(given.semantics, given.encoder, given.instances, given.views)
         self.session = EditSession(given.gaussians, context)
-        self.asker = Asker(given.semantics, given.encoder, given.predicted, given.with_templates)
+        self.asker = Asker(given.semantics, given.encoder, given.predicted, given.with_templates, given.make_tower)
 
     def subscribe(self, listener: Callable[[], None]) -> Callable[[], None]:
         """Have a function called after every change; returns one that ends this."""
@@ -149,14 +153,25 @@ class Workbench:
         with self._lock:
             return self.session.state
 
+    def require_still(self, operation: Operation) -> None:
+        """Refuse to edit a scene that moves.
+
+        Raises:
+            InputError: It does.
+        """
+        if self.frames > 1:
+            raise InputError(
+                f"{operation.name}: a moving scene can be looked at and asked, not edited; save the frame that is "
+                "shown as Scene (PLY), and open that"
+            )
+
     def apply(self, term: str, operation: Operation) -> str:
         """Edit what a term selects; says what was done.
 
         Raises:
             InputError: The scene moves, or as `EditSession.apply`; nothing has changed then.
         """
-        if self.frames > 1:
-            raise InputError(f"{operation.name}: a moving scene cannot be edited; open one of its frames")
+        self.require_still(operation)
         with self._lock:
             before = len(self.session.state.gaussians)
             after = self.session.apply(EditStep(Selection((term,), clean=False), operation))
@@ -221,11 +236,27 @@ class Workbench:
             self.asker = replace(self.asker, semantics=semantics)
             self._changed()
 
+    def extent(self) -> tuple[tuple[float, float, float], tuple[float, float, float]]:
+        """Two corners of a box that holds all centers but the outermost hundredth on each side [scene units]."""
+        means = self.materials.gaussians.means[self.materials.gaussians.finite].double().cpu()
+        if not len(means):
+            return (0.0, 0.0, 0.0), (0.0, 0.0, 0.0)
+        ordered, last = means.sort(dim=0).values, len(means) - 1
+        low, high = ordered[last // 100].tolist(), ordered[last - last // 100].tolist()
+        return (low[0], low[1], low[2]), (high[0], high[1], high[2])
+
     def depth_range(self) -> tuple[float, float]:
         """Near and far plane for cameras that move freely in the scene [world units]."""
-        near = near_plane(self.materials.views) if self.materials.views else None
-        if near is None:
-            means = self.materials.gaussians.means[self.materials.gaussians.finite]
-            spread = (means - means.median(dim=0).values).norm(dim=1).median() if len(means) else torch.ones(())
-            near = max(float(spread) / LEAST_STEPS, 1e-6)
-        return near, near * 1e8
+        given = self.materials
+        if self._range is None or self._range[0] is not given:  # asked for with every move of a camera
+            self._range = given, _depth_range(given)
+        return self._range[1]
+
+
+def _depth_range(given: Materials) -> tuple[float, float]:
+    near = near_plane(given.views) if given.views else None
+    if near is None:
+        means = given.gaussians.means[given.gaussians.finite]
+        spread = (means - means.median(dim=0).values).norm(dim=1).median() if len(means) else torch.ones(())
+        near = max(float(spread) / LEAST_STEPS, 1e-6)
+    return near, near * 1e8

@@ -32,7 +32,11 @@ def to_picture(image: Any) -> Picture:
     pixels = np.asarray(image.detach().cpu() if hasattr(image, "detach") else image)
     if pixels.dtype == np.uint8:
         return pixels
-    return (np.nan_to_num(pixels).clip(0.0, 1.0) * 255.0 + 0.5).astype(np.uint8)
+    shares = np.fmax(pixels, 0.0)  # a copy, for what follows is in place; NaN becomes 0
+    np.fmin(shares, 1.0, out=shares)
+    shares *= 255.0
+    shares += 0.5
+    return shares.astype(np.uint8)
 
 
 def overlay(image: Any, channel: Any, colours: Picture, strength: float = 0.6) -> Picture:

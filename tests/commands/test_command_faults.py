@@ -152,8 +152,9 @@ def test_a_write_that_fails_leaves_what_was_there(tmp_path, monkeypatch):
     assert os.listdir(tmp_path) == ["a.json"]
 
 
-def test_safetensors_are_written_in_one_place():
-    """The library's own writer has errors of its own, and other bytes from run to run."""
+@pytest.mark.parametrize(("call", "places"), [("save_file(", []), ("torch.save(", ["files/torch_files.py"])])
+def test_libraries_write_in_one_place(call, places):
+    """Their writers have errors of their own on a full disk, and safetensors' other bytes from run to run."""
     source = Path(ROOT) / "sgwarp"
-    found = [str(path.relative_to(source)) for path in source.rglob("*.py") if "save_file(" in path.read_text()]
-    assert found == []
+    found = [str(path.relative_to(source)) for path in source.rglob("*.py") if call in path.read_text()]
+    assert found == places

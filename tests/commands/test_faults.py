@@ -44,6 +44,28 @@ def test_a_full_output_is_one_line(arguments):
     assert done.stderr == "sgwarp: output cannot be read or written (No space left on device)\n"
 
 
+@pytest.mark.parametrize("closed", [(0,), (1,), (0, 1, 2)])
+def test_closed_streams(tmp_path, closed):
+    """`sgwarp ... >&-`: no traceback, and no file is opened under the number of a standard stream."""
+    code = (
+        "import os, sys\n"
+        f"for number in {closed}: os.close(number)\n"
+        "sys.stdin, sys.stdout, sys.stderr = (None if n in "
+        f"{closed} else s for n, s in enumerate((sys.stdin, sys.stdout, sys.stderr)))\n"
+        "from sgwarp.cli import main\n"
+        "code = main(['--version'])\n"
+        "kept = open(sys.argv[1], 'w')\n"
+        'kept.write(f\'{code} {kept.fileno() > 2} {main(["info", "/nowhere/a.ply"])}\')'
+    )
+    done = subprocess.run(
+        [sys.executable, "-c", code, tmp_path / "a"], env={**os.environ, "PYTHONPATH": ROOT},
+        capture_output=True, text=True, check=False,
+    )  # fmt: skip
+    assert done.returncode == 0, done.stderr
+    assert "Traceback" not in done.stderr
+    assert (tmp_path / "a").read_text() == "0 True 2"
+
+
 def test_a_terminal_without_the_characters_gets_escapes():
     environment = {"LC_ALL": "C", "PYTHONUTF8": "0", "PYTHONCOERCECLOCALE": "0", "PYTHONIOENCODING": "ascii"}
     done = subprocess.run(**command("--help", **environment), stdout=subprocess.PIPE, check=False)

@@ -430,6 +430,17 @@ def test_report_arguments(stopped, stage_files, tmp_path):
     assert call.extremes == ()
 
 
+def test_report_takes_views_of_another_world(stopped, stage, stage_files, tmp_path, capsys):
+    path = tmp_path / "move.json"
+    path.write_text(json.dumps({"transform": [[1, 0, 0, 0.5], [0, 1, 0, 0], [0, 0, 1, 0]], "scale": 1.0}))
+    arguments = ["report", stage_files.scene, "--views", stage_files.views, "--out", tmp_path / "o"]
+    call = stopped("sgwarp.evaluation.report.run.make_report", *arguments, "--transform", path)
+    moved = call.positional[1][2].camera.position - stage.views[2].camera.position
+    torch.testing.assert_close(moved, torch.tensor([0.5, 0, 0], dtype=torch.float64), rtol=0, atol=1e-5)
+    assert run(*arguments, "--images", "images_4") == 2
+    assert "COLMAP models only" in capsys.readouterr().err
+
+
 def test_poses_arguments(stopped, stage_files, tmp_path):
     target, source = "sgwarp.commands.poses.find_poses", stage_files.views / "images"
     call = stopped(target, "poses", source, "--out", tmp_path / "o").positional

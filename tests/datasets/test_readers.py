@@ -242,6 +242,30 @@ def test_scannet_mesh(writer):
     assert points.labels.tolist() == [14, 0]
 
 
+def test_scannet_objects_of_vertices(writer):
+    """Vertices name segments, objects list segments; a segment of no object has none."""
+    root = write_scannet(writer)
+    base = "scans/scene0050_02/scene0050_02"
+    header = "ply\nformat ascii 1.0\nelement vertex 4\nproperty float x\nproperty float y\nproperty float z\n"
+    rows = "0 0 0 5\n1 0 0 5\n2 0 0 1\n3 0 0 7\n"
+    writer.text(f"{base}_vh_clean_2.labels.ply", f"{header}property ushort label\nend_header\n{rows}")
+    groups = [
+        {"id": 0, "objectId": 0, "segments": [40, 12], "label": "chair"},
+        {"id": 1, "objectId": 7, "segments": [3], "label": "desk"},
+    ]
+    writer.text(f"{base}.aggregation.json", json.dumps({"segGroups": groups}))
+    assert scannet.open_scene(root, "scene0050_02").load_points().instances is None
+    segments = f"{base}_vh_clean_2.0.010000.segs.json"
+    writer.text(segments, json.dumps({"segIndices": [12, 40, 99, 3]}))
+    assert scannet.open_scene(root, "scene0050_02").load_points().instances.tolist() == [1, 1, 0, 8]
+    writer.text(segments, json.dumps({"segIndices": [12, 40, 99]}))
+    with pytest.raises(InputError, match="3 vertices, but the mesh has 4"):
+        scannet.open_scene(root, "scene0050_02").load_points()
+    writer.text(segments, json.dumps({"segIndices": "all"}))
+    with pytest.raises(InputError, match="segIndices"):
+        scannet.open_scene(root, "scene0050_02").load_points()
+
+
 def test_intrinsics_of_photographs_at_their_own_size_stay(writer):
     K = np.array([[500.0, 0, 324.0], [0, 500.0, 242.0], [0, 0, 1]])
     assert torch.allclose(scannet.scaled_intrinsics(K, 648, 484), torch.from_numpy(K))

@@ -90,6 +90,9 @@ def test_a_saved_room_reads_back(rooms, tmp_path):
     views = scene.load_views()
     classes, depth = room_truth(rooms[0], views[1].camera)
     assert torch.equal(scene.load_labels("0001"), classes)
+    pieces = scene.load_instances("0001") - 1
+    assert len(pieces.unique()) > len(classes.unique())  # several of a class
+    assert torch.equal(rooms[0].class_of_piece[pieces], classes)
     assert torch.allclose(torch.from_numpy(scene.load_depth(views[1])).double(), depth, atol=6e-4)
     assert scene.classes == CLASSES
     assert load_gaussians(scene.gaussians).extras["label"].tolist() == rooms[0].classes.tolist()

@@ -44,6 +44,16 @@ def test_the_threshold_is_strict_and_sizes_stand_in_for_scores():
     assert larger_first.average_precision(0.5) == pytest.approx(0.5)
 
 
+def test_what_lies_where_nothing_is_scored_does_not_count():
+    """The surest prediction matches nothing, three quarters of it unscored: wrong only where more may lie outside."""
+    found = Detections()
+    ignored = torch.zeros(20, dtype=torch.bool)
+    ignored[10:13] = True
+    found.add(line((10, 14), (0, 4)), line((0, 4)), torch.tensor([0.9, 0.5]), ignored)
+    assert found.average_precision(0.5) == 1.0
+    assert found.average_precision(0.75) == pytest.approx(0.5)
+
+
 def test_ids_of_two_images_never_meet():
     found = Detections()
     found.add(line((0, 4)), line(), torch.tensor([0.9]))

@@ -222,3 +222,19 @@ def test_the_browser_draws_splats_that_look_like_our_pictures(page):
     page.page.get_by_label("Splats in the browser").uncheck()
     until(lambda: not page.session.stream.paused, "the pictures")
     page.shows(server, 0, 0.2, "the picture again")
+
+
+def test_keys_edit_but_not_while_a_query_is_typed(page, viewer, stage):
+    tab, count = page.session.tab, len(stage.gaussians)
+    page.click(page.place_of((0.55, -0.2, 3.2)))
+    until(lambda: tab.found, "the object")
+    box = page.page.locator("xpath=//label[normalize-space()='Query']/ancestor::*[.//input][1]//input").first
+    box.press_sequentially("rhnD")
+    until(lambda: tab.answers is not None, "the answers")
+    assert tab.found is not None
+    assert not viewer.bench.session.steps
+    box.blur()
+    page.page.keyboard.press("Shift+D")
+    until(lambda: len(viewer.bench.state.gaussians) < count, "the deletion")
+    page.page.keyboard.press("Control+z")
+    until(lambda: len(viewer.bench.state.gaussians) == count, "the undoing")

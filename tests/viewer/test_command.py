@@ -89,6 +89,20 @@ def test_view_of_a_moving_scene(opened, stage, tmp_path):
     assert opened.benches[0].frames == 3
 
 
+def test_semantics_of_another_scene_are_refused(opened, stage_files, label_semantics, tmp_path, capsys):
+    path = tmp_path / "S.safetensors"
+    save_semantics(label_semantics, path, {})  # its fingerprint is not that of the scene's file
+    assert run("view", stage_files.scene, "--semantics", path) == 2
+    assert "another" in capsys.readouterr().err
+    assert not opened.benches
+
+
+def test_the_folder_of_photographs_is_named_for_models_only(opened, stage_files, capsys):
+    """transforms.json lists its photographs; with a model, `load_views` takes the name."""
+    assert run("view", stage_files.scene, "--views", stage_files.views, "--images", "images_4") == 2
+    assert "COLMAP models only" in capsys.readouterr().err
+
+
 @pytest.mark.parametrize(
     "options",
     [

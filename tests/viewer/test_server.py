@@ -3,9 +3,11 @@
 import http.client
 import logging
 import socket
+import threading
 
 import pytest
 
+from sgwarp.apps.editing.operations import Remove
 from sgwarp.errors import InputError
 from sgwarp.viewer.server import Address, Viewer, open_viewer
 
@@ -233,6 +235,48 @@ def test_a_refused_value_is_told_and_changes_nothing(make_viewer):
     assert session.tab.answers is None
 
 
+def updates_of(client, uuid):
+    """New values that the program gives a control."""
+    updates = (message for message in client.messages if message["type"] == "GuiUpdateMessage")
+    return (update["updates"] for update in updates if update["uuid"] == uuid)
+
+
+def test_a_control_that_was_refused_goes_back(make_viewer, bench, monkeypatch):
+    from dataclasses import replace
+
+    bench.materials = replace(bench.materials, instances=None)
+    client = Client(make_viewer())
+    client.look()
+    mode = client.wait_for_control("GuiDropdownMessage", "Mode")
+    client.send("GuiUpdateMessage", uuid=mode, updates={"value": "instances"})
+    assert "--instances" in str(client.wait_for("NotificationShowMessage"))
+    assert next(updates_of(client, mode)) == {"value": "color"}
+
+    monkeypatch.setattr("sgwarp.viewer.splats.MOST_SPLATS", 10)
+    other = Client(make_viewer())
+    other.look()
+    box = other.wait_for_control("GuiCheckboxMessage", "Splats in the browser")
+    other.send("GuiUpdateMessage", uuid=box, updates={"value": True})
+    assert next(updates_of(other, box)) == {"value": False}
+    assert "too many for the browser" in str(other.wait_for("NotificationShowMessage"))
+
+
+def test_splats_stand_before_the_chosen_background(make_viewer):
+    import cv2
+    import numpy as np
+
+    client = Client(make_viewer())
+    client.look()
+    color = client.wait_for_control("GuiRgbMessage", "Background")
+    box = client.wait_for_control("GuiCheckboxMessage", "Splats in the browser")
+    client.send("GuiUpdateMessage", uuid=color, updates={"value": [10, 200, 30]})
+    client.send("GuiUpdateMessage", uuid=box, updates={"value": True})
+    client.wait_for("GaussianSplatsMessage")
+    pictures = (message for message in client.messages if message["type"] == "BackgroundImageMessage")
+    sent = (cv2.imdecode(np.frombuffer(message["rgb_data"], np.uint8), cv2.IMREAD_COLOR) for message in pictures)
+    assert next(one for one in sent if one.shape == (1, 1, 3)).tolist() == [[[30, 200, 10]]]
+
+
 def test_tabs_come_and_go(make_viewer):
     viewer = make_viewer()
     clients = [Client(viewer) for _ in range(3)]
@@ -245,6 +289,59 @@ def test_tabs_come_and_go(make_viewer):
         client.socket.close()
     assert _until(lambda: len(viewer.tabs) == 1)
     assert _until(lambda: len(viewer.streamer._streams) == 1)
+
+
+def test_a_tab_too_many_is_told(make_viewer, monkeypatch):
+    from sgwarp.viewer import server
+
+    monkeypatch.setattr(server, "MOST_TABS", 2)
+    viewer = make_viewer()
+    for _ in range(2):
+        client = Client(viewer)
+        client.look()
+        picture(client)
+    third = Client(viewer)
+    third.look()
+    assert "Too many tabs" in str(third.wait_for("NotificationShowMessage"))
+    assert len(viewer.tabs) == 2
+
+
+def test_a_key_does_what_its_command_says(make_viewer, stage):
+    viewer = make_viewer()
+    client = Client(viewer)
+    client.look()
+    commands = (message for message in client.messages if message["type"] == "RegisterCommandMessage")
+    undo = next(command["uuid"] for command in commands if command["props"]["label"] == "Undo")
+    client.send("CommandTriggerMessage", uuid="x" * 10**5)
+    client.send("CommandTriggerMessage", uuid=undo)
+    assert "no step was applied" in str(client.wait_for("NotificationShowMessage"))
+    viewer.bench.apply("rows:0-9", Remove())
+    client.send("CommandTriggerMessage", uuid=undo)
+    assert _until(lambda: len(viewer.bench.state.gaussians) == len(stage.gaussians))
+
+
+def test_a_tab_that_leaves_in_the_middle_of_a_query_harms_nobody(make_viewer, bench, caplog):
+    asked, go_on = threading.Event(), threading.Event()
+    original = bench.asker.ask
+
+    def slow(*arguments):
+        asked.set()
+        assert go_on.wait(60)
+        return original(*arguments)
+
+    bench.asker.ask = slow
+    viewer = make_viewer()
+    client = Client(viewer)
+    client.look()
+    client.send("GuiUpdateMessage", uuid=client.wait_for_query_box(), updates={"value": "lamp"})
+    assert asked.wait(60)
+    client.socket.close()
+    assert _until(lambda: not viewer.tabs)
+    go_on.set()
+    other = Client(viewer)
+    other.look()
+    assert picture(other).std() > 10
+    assert "Traceback" not in caplog.text
 
 
 def _until(ready) -> bool:

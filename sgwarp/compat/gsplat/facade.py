@@ -25,10 +25,11 @@ from sgwarp.compat.gsplat.pixels import spherical_harmonics as spherical_harmoni
 from sgwarp.compat.gsplat.projection import fully_fused_projection as fully_fused_projection
 from sgwarp.compat.gsplat.projection import project_images
 from sgwarp.compat.gsplat.projection import quat_scale_to_covar_preci as quat_scale_to_covar_preci
-from sgwarp.ops.planar.harmonics import harmonics_sum
+from sgwarp.ops.planar.harmonics import harmonic_colors
 from sgwarp.ops.planar.projection import CAMERA_MODELS, ProjectedSplats, ProjectionSettings, select_rows
 from sgwarp.ops.planar.splats import SplatJob, composite_splats
 from sgwarp.runs.isolation import isolated
+from sgwarp.scene.checks import require_finite
 
 RENDER_MODES = ("RGB", "D", "ED", "RGB+D", "RGB+ED")
 RASTERIZE_MODES = ("classic", "antialiased")
@@ -148,6 +149,7 @@ def rasterization(
     channels = colors.shape[-1]
     if backgrounds is not None:
         expect_shape("backgrounds", backgrounds, (*batch, C, channels))
+        require_finite("backgrounds", backgrounds)
 
     antialiased = rasterize_mode == "antialiased"
     settings = ProjectionSettings(camera_model, near_plane, far_plane, eps2d, radius_clip, antialiased)
@@ -207,7 +209,8 @@ def _values(
             center = torch.linalg.inv(viewmat.to(means.device, torch.float64))[:3, 3]
             mean = select_rows(images.scenes(means)[scene], p.index, sparse)
             directions = (mean.to(torch.float64) - center).to(mean)
-            rows = (harmonics_sum(directions, rows, sh_degree) + 0.5).clamp(min=0.0)
+            colors_of_rows, shown = harmonic_colors(directions, rows, sh_degree)
+            rows = torch.where(shown[:, None], colors_of_rows, torch.nan)  # which is left out
         values.append(rows)
     return values
 

@@ -15,6 +15,7 @@ from sgwarp.ops.planar.intersections import first_entries, intersect_boxes
 from sgwarp.ops.planar.pixel_lists import composite_pairs, contributors_in_range
 from sgwarp.ops.planar.splats import ListedSplats, SplatJob, composite_splats, factors_from_conics
 from sgwarp.runs.isolation import isolated
+from sgwarp.scene.checks import require_finite
 
 ALPHA_MAX = 0.999
 MAX_SH_DEGREE = 4
@@ -130,6 +131,7 @@ def rasterize_to_pixels(
     expect_shape("isect_offsets", isect_offsets, (*lead, rows, columns))
     if backgrounds is not None:
         expect_shape("backgrounds", backgrounds, (*lead, channels))
+        require_finite("backgrounds", backgrounds)
     if masks is not None:
         expect_shape("masks", masks, (*lead, rows, columns))
 
@@ -245,13 +247,18 @@ def accumulate(
         gaussian_ids, pixel_ids, image_ids: Pairs, [M] each; those of one pixel stand front to back.
 
     Returns:
-        Colours [..., H, W, D] and opacities [..., H, W, 1], differentiable in the first four.
+        Colours [..., H, W, D] and opacities [..., H, W, 1], differentiable in the first four. Pairs of splats that are
+        not finite are left out.
     """
     lead, N, channels = tuple(means2d.shape[:-2]), means2d.shape[-2], colors.shape[-1]
     expect_shape("conics", conics, (*lead, N, 3))
     expect_shape("opacities", opacities, (*lead, N))
     expect_shape("colors", colors, (*lead, N, channels))
     rows = image_ids * N + gaussian_ids
+    parts = (t.detach().reshape(math.prod(lead) * N, -1) for t in (means2d, conics, opacities, colors))
+    finite = torch.isfinite(torch.stack([part.sum(dim=1, dtype=torch.float64) for part in parts]).sum(dim=0))
+    kept = finite[rows].nonzero()[:, 0]
+    rows, pixel_ids, image_ids = rows[kept], pixel_ids[kept], image_ids[kept]
     at = torch.stack([pixel_ids % image_width, pixel_ids // image_width], dim=1) + 0.5
     dx, dy = (at - means2d.reshape(-1, 2)[rows]).unbind(1)
     A, B, C = conics.reshape(-1, 3)[rows].unbind(1)

@@ -52,14 +52,14 @@ class VLPartFiles:
         self.identity = f"vlpart, {least_score}"
 
     def _path(self, view: View) -> Path:
-        found = [path for path in (self.folder / f"{view.stem}{suffix}" for suffix in SUFFIXES) if path.is_file()]
+        found = [path for path in (self.folder / f"{view.stem}{suffix}" for suffix in SUFFIXES) if os.path.isfile(path)]
         if not found:
             raise MissingMap(f"{self.folder}: holds no {view.stem}.json or {view.stem}.npz")
         return found[0]
 
     def has_map(self, view: View) -> bool:
         """Whether there is a file for the view."""
-        return any((self.folder / f"{view.stem}{suffix}").is_file() for suffix in SUFFIXES)
+        return any(os.path.isfile(self.folder / f"{view.stem}{suffix}") for suffix in SUFFIXES)
 
     def identity_of(self, view: View) -> str:
         return hashlib.sha256(read_bytes(self._path(view))).hexdigest()

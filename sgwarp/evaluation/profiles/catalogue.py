@@ -9,8 +9,10 @@ from sgwarp.evaluation.profiles.base import Profile
 
 PLACES = {
     "room": "room:ROOM",
+    "room-instances": "instances:ROOM",
     "scannet12-2d": "scannet:FRAMES",
     "scannet-3d": "scannet:POINTS",
+    "scannet-instances": "instances:SCANNET",
     "lerf-ovs-loc": "lerf_ovs:LOCATION",
     "lerf-ovs-seg": "lerf_ovs:SEGMENTATION",
     "lerf-ovs-3d": "lerf_ovs:SELECTION",

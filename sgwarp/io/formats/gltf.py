@@ -129,6 +129,7 @@ def _primitive(document: Document, primitive: Mapping[str, Any]) -> Gaussians:
     for name in SPZ_EXTENSIONS:
         if name in inner:
             view = document.view(_mapping(inner[name]).get("bufferView"))
+            document.take(len(view))
             return gaussians_from_spz(document.path, bytes(view), PLY_AXES)  # the frame is the document's
     attributes = _mapping(primitive.get("attributes"))
 
@@ -144,11 +145,15 @@ def _primitive(document: Document, primitive: Mapping[str, Any]) -> Gaussians:
     while degree < 3 and f"{EXTENSION}:SH_DEGREE_{degree + 1}_COEF_0" in attributes:
         degree += 1
     names = [f"{EXTENSION}:SH_DEGREE_{d}_COEF_{n}" for d in range(degree + 1) for n in range(2 * d + 1)]
-    coefficients = [values(name, 3) for name in names]
-    sizes = {len(field) for field in (means, quats, scales, opacities, *coefficients)}
+    sizes = {len(field) for field in (means, quats, scales, opacities)}
+    sh = np.empty((len(means), len(names), 3), np.float32)
+    for place, name in enumerate(names):  # one after the other: all of them at once would be the scene once more
+        coefficients = values(name, 3)
+        sizes.add(len(coefficients))
+        if len(sizes) == 1:
+            sh[:, place] = coefficients
     if len(sizes) > 1 or 0 in sizes:
         raise InputError(f"{document.path}: its attributes hold {sorted(sizes)} Gaussians; expected one number, not 0")
-    sh = np.stack(coefficients, axis=1)
     if bool((scales < 0).any()) or bool(((opacities < 0) | (opacities > 1)).any()):
         raise InputError(f"{document.path}: holds a negative scale or an opacity outside 0 to 1; it is damaged")
     return build_gaussians(document.path, means, quats, scales, opacities, sh)

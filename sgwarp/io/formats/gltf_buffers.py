@@ -3,11 +3,10 @@
 from __future__ import annotations
 
 import base64
-import binascii
 import os
 import struct
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 from urllib.parse import unquote
@@ -21,6 +20,7 @@ from sgwarp.files.documents import parse_json
 
 MAGIC, JSON, BIN = b"glTF", 0x4E4F534A, 0x004E4942
 COMPONENTS = {5120: "i1", 5121: "u1", 5122: "<i2", 5123: "<u2", 5125: "<u4", 5126: "<f4"}
+MOST_USES, ALLOWANCE = 4, 1 << 20  # of each byte; bytes beyond, for small files
 WIDTHS = {"SCALAR": 1, "VEC2": 2, "VEC3": 3, "VEC4": 4}
 
 
@@ -32,11 +32,23 @@ class Document:
         path: The file.
         meta: Its JSON.
         buffers: The bytes of each buffer.
+        taken: Bytes that were decoded so far, in its only item.
     """
 
     path: Path
     meta: Mapping[str, Any]
     buffers: list[memoryview]
+    taken: list[int] = field(default_factory=lambda: [0])
+
+    def take(self, count: int) -> None:
+        """Note that `count` bytes of the buffers are decoded.
+
+        Raises:
+            InputError: They are all decoded again and again: a small file could name one array a million times.
+        """
+        self.taken[0] += count
+        if self.taken[0] > MOST_USES * sum(len(data) for data in self.buffers) + ALLOWANCE:
+            raise InputError(f"{self.path}: refers to its data more than {MOST_USES} times; export the scene again")
 
     def rows(self, key: str) -> list[Any]:
         """A list of the JSON, empty if it is not there."""
@@ -89,6 +101,7 @@ class Document:
         stride = self._whole(self.row("bufferViews", accessor["bufferView"]), "byteStride", row)
         if count < 1 or stride < row or start + (count - 1) * stride + row > len(data):
             raise InputError(f"{self.path}: attribute {name} ({count} rows) lies outside its buffer; it is cut short")
+        self.take(count * row)
         rows: NDArray[Any] = np.ndarray((count, width), dtype, data, start, (stride, dtype.itemsize))
         values = rows.astype(np.float32)
         if accessor.get("normalized") is True and dtype.kind in "iu":
@@ -114,13 +127,16 @@ def read_document(path: str | os.PathLike[str]) -> Document:
     if not isinstance(meta, dict) or not isinstance(meta.get("asset"), dict):
         raise InputError(f"{path}: is not a glTF file (no 'asset' in its JSON)")
     buffers = []
+    files: dict[str, memoryview] = {}  # each is read once, however often it is named
     listed = meta.get("buffers", [])
     for index, buffer in enumerate(listed if isinstance(listed, list) else []):
         uri = buffer.get("uri") if isinstance(buffer, dict) else None
         if uri is None and index == 0 and body is not None:
             buffers.append(body)
         else:
-            buffers.append(memoryview(_read_buffer(path, uri)))
+            if str(uri) not in files:
+                files[str(uri)] = memoryview(_read_buffer(path, uri))
+            buffers.append(files[str(uri)])
     return Document(path, meta, buffers)
 
 
@@ -147,7 +163,7 @@ def _read_buffer(path: Path, uri: Any) -> bytes:
     if uri.startswith("data:"):
         try:
             return base64.b64decode(uri.partition(",")[2], validate=True)
-        except binascii.Error as error:
+        except ValueError as error:  # of binascii, or of a text that is not ASCII
             raise InputError(f"{path}: a buffer's data are damaged ({error})") from None
     name = Path(unquote(uri))
     if name.is_absolute() or ".." in name.parts or "://" in uri:

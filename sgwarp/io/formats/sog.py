@@ -14,8 +14,6 @@ from __future__ import annotations
 
 import os
 import struct
-import zipfile
-import zlib
 from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
@@ -24,9 +22,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sgwarp.errors import InputError
-from sgwarp.files.access import read_bytes, reading
+from sgwarp.files.access import read_bytes
+from sgwarp.files.archives import Archive, open_archive
 from sgwarp.files.documents import parse_json
 from sgwarp.io.formats.axes import PLY_AXES, change_axes
+from sgwarp.io.formats.packed import most_gaussians
 from sgwarp.io.ply import build_gaussians
 from sgwarp.scene import Gaussians
 
@@ -35,8 +35,6 @@ PALETTES_A_ROW = 64
 COEFFICIENTS = {1: 3, 2: 8, 3: 15}  # above degree 0, by bands
 OTHERS = np.array([[1, 2, 3], [0, 2, 3], [0, 1, 3], [0, 1, 2]])
 LARGEST_META = 1 << 20  # bytes
-LEAST_LIMIT = 1 << 16  # Gaussians that any file may claim; beyond, one byte each is the least a real file has
-ZIP_ERRORS = (zipfile.BadZipFile, zlib.error, EOFError, KeyError, NotImplementedError, RuntimeError, ValueError)
 
 Fetch = Callable[[str], bytes]
 
@@ -64,26 +62,19 @@ def read_sog(path: str | os.PathLike[str], axes: str = PLY_AXES) -> Gaussians:
 
         gaussians = _decode(path, read_bytes(path), fetch, sum(files.values()))
     else:
-        with reading(path), open(path, "rb") as file:
-            try:
-                archive = zipfile.ZipFile(file)
-                root = next((name[: -len(META)] for name in archive.namelist() if name.endswith(META)), "")
-                size = path.stat().st_size
-                read = lambda name: _member(path, archive, root + name, size)  # noqa: E731
-                gaussians = _decode(path, read(META), read, size)
-            except InputError:
-                raise
-            except ZIP_ERRORS as error:
-                raise InputError(f"{path}: is not a SOG archive, or is damaged ({error})") from None
+        with open_archive(path) as archive:
+            root = next((name[: -len(META)] for name in archive.members if name.endswith(META)), "")
+            read = lambda name: _member(archive, root + name)  # noqa: E731
+            gaussians = _decode(path, read(META), read, archive.size)
     return change_axes(gaussians, axes, PLY_AXES)
 
 
-def _member(path: Path, archive: zipfile.ZipFile, name: str, size: int) -> bytes:
-    info = archive.getinfo(name)
-    if info.compress_size > size or info.file_size > 1032 * max(info.compress_size, 1):
-        raise InputError(f"{path}: its entry {name[:80]} claims {info.file_size} bytes; the file is damaged")
-    with archive.open(info) as member:
-        return member.read(info.file_size)
+def _member(archive: Archive, name: str) -> bytes:
+    """A picture or the JSON of an archive; neither shrinks much in a zip, so that a larger claim is false."""
+    info = archive.members.get(name)
+    if info is not None and info.file_size > 4 * archive.size + LARGEST_META:
+        raise InputError(f"{archive.path}: its entry {name[:80]!r} claims {info.file_size} bytes; the file is damaged")
+    return bytes(archive.read(name))
 
 
 class _Meta:
@@ -133,7 +124,7 @@ class _Meta:
 
 def _decode(path: Path, data: bytes, fetch: Fetch, size: int) -> Gaussians:
     meta = _Meta(path, data)
-    count = meta.whole(meta.meta.get("count"), "count", 1, max(size, LEAST_LIMIT))
+    count = meta.whole(meta.meta.get("count"), "count", 1, most_gaussians(size))
 
     def pixels(name: str, least: int = count) -> NDArray[np.uint8]:
         return _picture(path, name, fetch(name), least).reshape(-1, 4)

@@ -32,6 +32,7 @@ from sgwarp.errors import InputError
 from sgwarp.files.access import read_bytes
 from sgwarp.files.atomic import atomic_path
 from sgwarp.io.formats.axes import PLY_AXES, SPZ_AXES, change_axes
+from sgwarp.io.formats.packed import most_gaussians
 from sgwarp.io.formats.zstd import compress_zstd, decompress_zstd
 from sgwarp.io.ply import build_gaussians, host_arrays
 from sgwarp.scene import SH_COUNTS, Gaussians
@@ -107,10 +108,8 @@ def _read_gzip(path: str | os.PathLike[str], data: bytes) -> tuple[Header, list[
         if magic != MAGIC or version not in VERSIONS[:3]:
             raise InputError(f"{path}: is not an SPZ scene of version 1 to 3 (version {version})")
         header = _checked(path, Header(version, count, degree, bits, flags))
+        _require_room(path, header, len(data))
         total = sum(header.sizes)
-        # Deflate makes at most 1032 bytes of one: a larger claim is false, and nothing is allocated for it.
-        if total > 1032 * len(data):
-            raise InputError(f"{path}: claims {count} Gaussians, which {len(data)} bytes cannot hold; it is damaged")
         body = inflater.decompress(inflater.unconsumed_tail, total)
         inflater.decompress(inflater.unconsumed_tail, 1)  # reaches the checksum
     except zlib.error as error:
@@ -131,6 +130,7 @@ def _read_streams(path: str | os.PathLike[str], data: bytes) -> tuple[Header, li
     position = table + streams * STREAM.size
     if streams != len(sizes) or table < HEADER_4.size or position > len(data):
         raise InputError(f"{path}: its table of {streams} streams is damaged (expected {len(sizes)})")
+    _require_room(path, header, len(data))
     if header.flags & EXTENDED:
         header = replace(header, axes=_named_axes(path, data[HEADER_4.size : table]))
     arrays = []
@@ -158,6 +158,12 @@ def _named_axes(path: str | os.PathLike[str], records: bytes) -> str:
     if others:
         logging.getLogger("sgwarp").warning("%s: %d extension records are left out", path, others)
     return axes or SPZ_AXES
+
+
+def _require_room(path: str | os.PathLike[str], header: Header, size: int) -> None:
+    """Compare what a file of `size` bytes claims with them, before anything is unpacked."""
+    if header.count > most_gaussians(size):
+        raise InputError(f"{path}: claims {header.count} Gaussians, which {size} bytes cannot hold; it is damaged")
 
 
 def _checked(path: str | os.PathLike[str], header: Header) -> Header:

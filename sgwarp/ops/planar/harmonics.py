@@ -33,6 +33,28 @@ def harmonics_basis(directions: Tensor, degree: int) -> Tensor:
     return torch.stack(columns, dim=-1)
 
 
+def harmonic_colors(directions: Tensor, coefficients: Tensor, degree: int) -> tuple[Tensor, Tensor]:
+    """Colors of spherical harmonics, 0.5 plus their sum and at least 0, and the rows in which all numbers are finite.
+
+    The other rows are 0 and have no gradient: an infinity in one of them would leave a NaN in its direction's.
+
+    Args:
+        directions: Of any length, [N, 3].
+        coefficients: [N, K, C].
+
+    Returns:
+        [N, C] and bool [N].
+    """
+    coefficients = coefficients[:, : (degree + 1) ** 2]
+    total = coefficients.detach().sum(dim=(1, 2), dtype=torch.float64)
+    finite = torch.isfinite(total + directions.detach().sum(dim=1, dtype=torch.float64))
+    if finite.is_cuda or not bool(finite.all()):  # on CUDA to ask is to wait for the device
+        directions = torch.where(finite[:, None], directions, 0.0)
+        coefficients = torch.where(finite[:, None, None], coefficients, 0.0)
+    colors = (harmonics_sum(directions, coefficients, degree) + 0.5).clamp(min=0.0)
+    return torch.where(finite[:, None], colors, 0.0), finite
+
+
 def harmonics_sum(directions: Tensor, coefficients: Tensor, degree: int) -> Tensor:
     """Sum over k < (degree + 1)^2 of Y_k times coefficients.
 

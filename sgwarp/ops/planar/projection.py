@@ -14,6 +14,7 @@ import torch
 from torch import Tensor
 
 from sgwarp.errors import InputError
+from sgwarp.scene.checks import require_finite
 
 CAMERA_MODELS = ("pinhole", "ortho", "fisheye")
 MIN_QUAT_NORM2 = 1e-6  # |q|^2 below this has no direction
@@ -36,7 +37,7 @@ class ProjectionSettings:
         alpha_min: Splats fainter than this are left out, where opacities are known.
 
     Raises:
-        InputError: Unknown camera model, or an empty range of depth.
+        InputError: Unknown camera model, an empty range of depth, or NaN or infinity in a number but `far`.
     """
 
     camera_model: str = "pinhole"
@@ -53,6 +54,8 @@ class ProjectionSettings:
             raise InputError(f"camera_model: expected one of {', '.join(CAMERA_MODELS)}, got '{self.camera_model}'")
         if not self.near < self.far:
             raise InputError(f"near_plane: expected near < far, got {self.near} and {self.far}")
+        for name, value in (("eps2d", self.dilation), ("radius_clip", self.radius_clip)):
+            require_finite(name, value)
 
 
 @dataclass(frozen=True, eq=False)

@@ -129,9 +129,8 @@ class _CompositeSplats(torch.autograd.Function):
     ) -> tuple[Tensor, Tensor, Tensor]:
         keep = any(ctx.needs_input_grad)
         camera, settings = _frame(job.width, job.height), job.settings
-        projected = _as_splats(means2d, factors, opacities, depths, settings)
-        values = features.detach().to(torch.float32).contiguous()
-        tiles.leave_out_non_finite(projected, values)
+        values, finite = _finite_rows(features)
+        projected = _as_splats(means2d, factors, opacities, depths, finite, settings)
         if job.given is not None:
             lists = _follow(job.given, projected, values, camera)
         else:
@@ -162,7 +161,7 @@ class _CompositeSplats(torch.autograd.Function):
             tiles.TileLists(*kept[3:]),
             _frame(job.width, job.height),
             job.settings,
-            features.detach().to(torch.float32).contiguous(),
+            _finite_rows(features)[0],
             features.shape[1],
             (kept[0], kept[1], kept[2]),
             backward.ImageGradients(v_image, v_transmittance, v_depth_sum if job.wants_depth else None),
@@ -203,8 +202,24 @@ def _padded(values: Tensor) -> Tensor:
     return torch.nn.functional.pad(values, (0, 3 - values.shape[1])).contiguous()
 
 
+def _finite_rows(features: Tensor) -> tuple[Tensor, Tensor | None]:
+    """Features as the kernels read them, float32 [V, C], and the rows without NaN or infinity, bool [V] or None for
+    all; the others are zero, for they would reach pixels far from their splat, as zero times infinity."""
+    values = features.detach().to(torch.float32).contiguous()
+    # On CUDA it is cheaper to look at all rows than to wait for the answer.
+    if not values.is_cuda and bool(torch.isfinite(values.sum(dtype=torch.float64))):
+        return values, None
+    finite = torch.isfinite(values.sum(dim=1, dtype=torch.float64))
+    return torch.where(finite[:, None], values, 0.0), finite
+
+
 def _as_splats(
-    means2d: Tensor, factors: Tensor, opacities: Tensor, depths: Tensor, settings: RasterSettings
+    means2d: Tensor,
+    factors: Tensor,
+    opacities: Tensor,
+    depths: Tensor,
+    finite: Tensor | None,
+    settings: RasterSettings,
 ) -> tiles.Projected:
     """The tensors in the layout of the kernels' `Splat`, with the footprint's extent and whether it can be seen."""
     device = means2d.device
@@ -218,6 +233,7 @@ def _as_splats(
         columns = [*means2d.unbind(1), a, b, c, level, depths, *footprint]
         values = torch.stack([t.to(torch.float32) for t in columns], dim=1)
         seen = torch.isfinite(values.sum(1)) & (reach >= LEVEL_SLACK) & (a > 0) & (c > 0)
+        seen = seen if finite is None else seen & finite
         hidden = values.new_tensor([0.0, 0.0, 1.0, 0.0, 1.0, HIDDEN_LEVEL, 0.0, 0.0, 0.0, HIDDEN_LEVEL, 0.0, 1.0])
         memory = tiles.splat_memory(len(values), device, "composited splats")
         rows = memory.view(torch.float32).view(-1, tiles.SPLAT_WORDS)

@@ -9,14 +9,14 @@ import torch
 from torch import Tensor
 
 from sgwarp.errors import InputError
-from sgwarp.ops.planar.harmonics import harmonics_sum
+from sgwarp.ops.planar.harmonics import harmonic_colors
 from sgwarp.ops.splatting import backward, forward, tiles
-from sgwarp.ops.splatting.forward import Rendering, composite_recorded, packed_colors, require_finite
+from sgwarp.ops.splatting.forward import Rendering, composite_recorded, packed_colors, require_finite_features
 from sgwarp.ops.splatting.plan import RenderPlan, plan_render
 from sgwarp.ops.splatting.settings import RasterSettings
 from sgwarp.runs.isolation import uncompiled
 from sgwarp.scene import SH_COUNTS, Camera, Gaussians
-from sgwarp.scene.checks import dense
+from sgwarp.scene.checks import dense, require_finite
 
 
 @uncompiled
@@ -108,18 +108,22 @@ def rasterize(
     if features is not None:
         if not (features.ndim == 2 and len(features) == n and features.shape[1] > 0 and features.is_floating_point()):
             raise InputError(f"features: expected floating point [{n}, C], got {features.dtype} {list(features.shape)}")
-        require_finite(features)
-    if sh is not None and not (sh.ndim == 3 and sh.shape[1] in SH_COUNTS):
+        require_finite_features(features)
+    _check_fields(means, quats, scales, opacities)
+    if sh is not None and not (sh.ndim == 3 and len(sh) == n and sh.shape[1] in SH_COUNTS and sh.shape[2] == 3):
         raise InputError(f"sh: expected shape [{n}, 1, 4, 9 or 16, 3], got {list(sh.shape)}")
+    camera = Camera(K, viewmat, width, height, near, far)
     if sh is not None and features is not None:
-        features, sh = torch.cat([_colors(means, sh, viewmat), features.to(means)], dim=1), None
+        colors, shown = _colors(means, sh, viewmat)
+        features, sh = torch.cat([colors, features.to(means)], dim=1), None
+        opacities = torch.where(shown, opacities, 0.0)
         values = features
     channels = 3 if features is None else features.shape[1]
     if background is not None and tuple(background.shape) != (channels,):
         raise InputError(f"background: expected shape [{channels}], got {list(background.shape)}")
+    if background is not None:
+        require_finite("background", background)
 
-    _check_fields(means, quats, scales, opacities)
-    camera = Camera(K, viewmat, width, height, near, far)
     inputs = (means, quats, scales, opacities, values, viewmat, means2d, background)
     if not (torch.is_grad_enabled() and any(t is not None and t.requires_grad for t in inputs)):
         colors = means.new_zeros(n, 1, 3) if sh is None else sh
@@ -159,12 +163,11 @@ def rasterize(
     return Rendering(image, alpha, mean_depth, surface if depth else None, request.status_counts)
 
 
-def _colors(means: Tensor, sh: Tensor, viewmat: Tensor) -> Tensor:
-    """Colors of the harmonics seen from the camera, [N, 3]; 0 where they are not finite, as nothing is rendered."""
+def _colors(means: Tensor, sh: Tensor, viewmat: Tensor) -> tuple[Tensor, Tensor]:
+    """Colors of the harmonics seen from the camera, [N, 3], and which Gaussians have one, bool [N]."""
     pose = viewmat.to(means)
     directions = means + pose[:3, 3] @ pose[:3, :3]  # the camera lies at -R^T t
-    degree = SH_COUNTS.index(sh.shape[1])
-    return torch.nan_to_num((harmonics_sum(directions, sh.to(means), degree) + 0.5).clamp(min=0.0), posinf=0.0)
+    return harmonic_colors(directions, sh.to(means), SH_COUNTS.index(sh.shape[1]))
 
 
 def _as_gaussians(*fields: Tensor) -> Gaussians:

@@ -19,6 +19,7 @@ from sgwarp.ops.splatting import tiles
 from sgwarp.ops.splatting.plan import RenderPlan, Values, plan_render
 from sgwarp.ops.splatting.settings import RasterSettings
 from sgwarp.scene import Camera, Gaussians
+from sgwarp.scene.checks import require_finite
 
 LANE = 16
 WIDE_PASS = 4  # slices of 16 channels that one walk over the tiles composites; more would leave the cache
@@ -81,10 +82,12 @@ def rasterize(
         ok = features.ndim == 2 and len(features) == n and features.shape[1] > 0 and features.is_floating_point()
         if not ok:
             raise InputError(f"features: expected floating point [{n}, C], got {features.dtype} {list(features.shape)}")
-        require_finite(features)
+        require_finite_features(features)
     channels = 3 if features is None else features.shape[1]
     if background is not None and tuple(background.shape) != (channels,):
         raise InputError(f"background: expected shape [{channels}], got {list(background.shape)}")
+    if background is not None:
+        require_finite("background", background)
 
     if plan is None:
         values: Values = "colors" if features is None else "features"
@@ -105,7 +108,7 @@ def rasterize(
     return Rendering(image, alpha, mean_depth, surface if depth else None, projected.counts())
 
 
-def require_finite(features: Tensor) -> None:
+def require_finite_features(features: Tensor) -> None:
     """Refuse NaN and infinity, on the CPU. On CUDA to look at the values is to wait for the device: there their
     Gaussians are left out (`tiles.leave_out_non_finite`).
 
