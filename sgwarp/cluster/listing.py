@@ -14,9 +14,14 @@ from sgwarp.errors import InputError
 from sgwarp.files.access import read_bytes
 
 RESERVED = ("shards",)  # folders of the output that are no scenes
+LONGEST = 200  # bytes of a name: file systems hold 255, and a folder at work adds some
 POINTS = ("points3D.ply", "sparse_pc.ply", "point_cloud.ply")  # of data sets, to start a fit from
 MAGIC = ("*", "?", "[")
 LARGEST = 1 << 26  # bytes of a list
+
+
+class MissingScene(InputError):
+    """A folder holds no trained scene; that is a fault of this scene, not of the list."""
 
 
 @dataclass(frozen=True)
@@ -34,13 +39,14 @@ class Scene:
     options: dict[str, str] = field(default_factory=dict)
 
 
-def list_scenes(source: str) -> list[Scene]:
+def list_scenes(source: str, out: Path | None = None) -> list[Scene]:
     """The scenes that a list names.
 
     Args:
         source: A folder, each of whose folders and .ply files is a scene; a pattern such as "scans/*/dslr"; a .txt file
             with a path in each line, followed by option=value if needed; or a .csv file with a column `path`, perhaps
-            `name`, and one for each option. Paths in a file are relative to it.
+            `name`, and one for each option. Paths in a file are relative to it; lines that begin with # are comments.
+        out: The folder of results: it is no scene where it lies beside them.
 
     Raises:
         InputError: There is no list, no scene in it, or two scenes have one name.
@@ -49,13 +55,13 @@ def list_scenes(source: str) -> list[Scene]:
     found: list[tuple[str, Path, dict[str, str]]]
     if os.path.isdir(path):
         entries = sorted(p for p in path.iterdir() if p.name[0] != "." and (p.is_dir() or p.suffix == ".ply"))
-        found = [(_name(p), p, {}) for p in entries]
-    elif path.suffix == ".csv" and os.path.isfile(path):
+        found = [(_name(p), p, {}) for p in entries if not _same_place(p, out)]
+    elif path.suffix.lower() == ".csv" and os.path.isfile(path):
         found = list(_csv_rows(path))
     elif os.path.isfile(path):
         found = list(_text_lines(path))
     elif any(mark in source for mark in MAGIC):
-        matches = sorted(map(Path, glob.glob(source, recursive=True)))
+        matches = sorted(p for p in map(Path, glob.glob(source, recursive=True)) if not _same_place(p, out))
         found = list(zip(_names_apart(matches), matches, [{} for _ in matches], strict=True))
     else:
         raise InputError(f"{source}: no such folder, list or pattern; check the path")
@@ -93,23 +99,36 @@ def parse_shard(shard: str) -> tuple[int, int]:
     return index, count
 
 
+def _same_place(path: Path, out: Path | None) -> bool:
+    return out is not None and path.resolve() == out.resolve()
+
+
 def _csv_rows(path: Path) -> Iterator[tuple[str, Path, dict[str, str]]]:
-    rows = csv.DictReader(_read(path).splitlines())
+    lines = ["" if line.startswith("#") else line for line in _read(path).splitlines()]
+    before = next((number for number, line in enumerate(lines) if line), 0)  # lines before the names of the columns
+    rows = csv.DictReader(lines[before:])
     try:
-        yield from _scenes_of(path, rows)
+        yield from _scenes_of(path, rows, before)
     except csv.Error as error:  # of a cell without end, for one
-        raise InputError(f"{path}: line {rows.line_num} cannot be read ({error}); quote cells in pairs") from None
+        line = before + rows.line_num
+        raise InputError(f"{path}: line {line} cannot be read ({error}); quote cells in pairs") from None
 
 
-def _scenes_of(path: Path, rows: csv.DictReader[str]) -> Iterator[tuple[str, Path, dict[str, str]]]:
-    if "path" not in (rows.fieldnames or ()):
+def _scenes_of(path: Path, rows: csv.DictReader[str], before: int) -> Iterator[tuple[str, Path, dict[str, str]]]:
+    heads = [head.strip() for head in rows.fieldnames or ()]
+    if "path" not in heads:
         raise InputError(f"{path}: has no column 'path'; its first line names the columns: path,name,fit.steps,...")
+    if twice := next((head for head in heads if head and heads.count(head) > 1), None):
+        raise InputError(f"{path}: column '{twice}' stands there twice; leave one")
     for row in rows:
         if None in row:
-            raise InputError(f"{path}: line {rows.line_num} has more cells than there are columns; quote commas")
-        cells = {key.strip(): (value or "").strip() for key, value in row.items()}
+            line = before + rows.line_num
+            raise InputError(f"{path}: line {line} has more cells than there are columns; quote commas")
+        cells = {head: (value or "").strip() for head, value in zip(heads, row.values(), strict=True)}
+        if not any(cells.values()):
+            continue
         if not cells["path"]:
-            raise InputError(f"{path}: line {rows.line_num} has no path")
+            raise InputError(f"{path}: line {before + rows.line_num} has no path")
         place = path.parent / cells.pop("path")
         yield cells.pop("name", "") or _name(place), place, {key: value for key, value in cells.items() if value}
 
@@ -155,7 +174,8 @@ def _check_names(scenes: Iterable[Scene], source: str) -> None:
     seen: dict[str, Scene] = {}
     for scene in scenes:
         name = scene.name
-        if not name or name[0] == "." or "/" in name or "\\" in name or not name.isprintable() or name in RESERVED:
+        fits = name.isprintable() and len(os.fsencode(name)) <= LONGEST and not {"/", "\\"} & set(name)
+        if not (fits and name) or name[0] == "." or name in RESERVED:
             raise InputError(f"{source}: {name!r} cannot be the name of a folder of results; give it another name")
         if name in seen:
             both = f"{seen[name].path} and {scene.path}"
@@ -167,11 +187,12 @@ def gaussians_in(folder: Path) -> Path:
     """The trained scene in a folder: scene.ply, or the only .ply there that holds no points to start from.
 
     Raises:
-        InputError: There is none, or more than one.
+        MissingScene: There is none, or more than one.
     """
     if (folder / "scene.ply").is_file():
         return folder / "scene.ply"
     found = sorted(p for p in folder.glob("*.ply") if p.name not in POINTS)
     if len(found) != 1:
-        raise InputError(f"{folder}: holds {len(found)} scenes (.ply); name one with the option scene, or do fit first")
+        what = f"{folder}: holds {len(found)} scenes (.ply)"
+        raise MissingScene(f"{what}; name one with the option scene, or do fit first")
     return found[0]

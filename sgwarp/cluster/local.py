@@ -16,8 +16,10 @@ from typing import Any
 
 from sgwarp.cluster.tasks import Outcome, Task
 from sgwarp.cluster.working import give_up
+from sgwarp.errors import InputError
 
 TRIES = 4  # processes that a scene may use up before it is recorded as failed
+KILLS = 20  # workers killed from outside before their first scene, in a row, until the run is given up
 BOOT = "import json, sys; sys.path[:] = json.loads(sys.argv[1]); from sgwarp.cluster.worker import serve; serve({})"
 
 
@@ -38,12 +40,14 @@ class LocalEngine:
         prepare: Called in each worker before its first task.
         warm: Called in the first worker before the others start: what it compiles and downloads is there for them.
         environment: Added to that of the workers.
+        devices: CUDA devices, as CUDA_VISIBLE_DEVICES names them: each worker sees one, in turn. All if empty.
     """
 
     workers: int = 1
     prepare: Call | None = None
     warm: Call | None = None
     environment: dict[str, str] = field(default_factory=dict)
+    devices: tuple[str, ...] = ()
 
     def __call__(self, tasks: Iterable[Task]) -> Iterator[Outcome]:
         """Outcomes, as scenes end; workers that are killed are replaced, and their scenes done again."""
@@ -57,10 +61,13 @@ class LocalEngine:
 class _Worker:
     """A process, the calls that it is to make first, and the task it is at; None while it prepares."""
 
-    def __init__(self, engine: LocalEngine, calls: Sequence[Call]) -> None:
+    def __init__(self, engine: LocalEngine, calls: Sequence[Call], device: str | None) -> None:
         command = [sys.executable, "-c", BOOT.format(os.getpid()), json.dumps([os.path.abspath(p) for p in sys.path])]
         pipes = {"stdin": subprocess.PIPE, "stdout": subprocess.PIPE}
+        self.device = device
         environment = {**os.environ, **engine.environment}
+        if device is not None:
+            environment["CUDA_VISIBLE_DEVICES"] = device
         # A session of its own: Ctrl-C reaches the driver alone, which then ends the workers.
         self.process = subprocess.Popen(command, **pipes, env=environment, start_new_session=True)  # type: ignore[call-overload]
         self.task: Task | None = None
@@ -107,10 +114,15 @@ class _Pool:
 
     def _start(self) -> None:
         calls = (self.engine.prepare, None if self.warmed else self.engine.warm)
-        worker = _Worker(self.engine, [call for call in calls if call is not None])
+        worker = _Worker(self.engine, [call for call in calls if call is not None], self._free_device())
         self.selector.register(worker.process.stdout, selectors.EVENT_READ, worker)
         if not worker.preparing:
             self._next(worker)
+
+    def _free_device(self) -> str | None:
+        """The device that the fewest workers have."""
+        taken = [key.data.device for key in self.selector.get_map().values()]
+        return min(self.engine.devices, key=taken.count, default=None)
 
     def _next(self, worker: _Worker) -> None:
         """Give the worker a task, or send it home."""
@@ -139,8 +151,8 @@ class _Pool:
         worker.kill()
         if task is None:
             self.unprepared += 1
-            if self.unprepared >= TRIES:
-                raise RuntimeError(f"workers end before they have begun, the last one {_how(code)}")
+            if self.unprepared >= (TRIES if code >= 0 else KILLS):
+                raise InputError(f"workers end before their first scene, the last one {_how(code)}; see above")
             self._start()
             return None
         self.deaths[task.name] = self.deaths.get(task.name, 0) + 1

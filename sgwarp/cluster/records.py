@@ -15,19 +15,27 @@ import json
 import os
 import shutil
 import time
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator, Set
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from sgwarp.errors import InputError
 from sgwarp.files import documents
 from sgwarp.files.atomic import atomic_path
 
+if TYPE_CHECKING:
+    from sgwarp.cluster.tasks import Task
+
 DONE, FAILED, STAGES = "done.json", "failed.json", "stages.json"
-WAIT = 20.0  # seconds for a lock: workers of a killed driver end within one
+LOG = "log.txt"  # what the commands of a scene have printed
+WAIT = 3.0  # seconds for a lock: workers of a killed driver end within one
 CHUNK = 2**20
+
+
+class Held(InputError):
+    """Another process is at the scene."""
 
 
 @dataclass(frozen=True)
@@ -54,6 +62,19 @@ class Place:
     def old(self) -> Path:
         return self.folder / f".{self.name}.old"
 
+    def prepare(self) -> None:
+        """Remove what a process left that was killed while it replaced older results.
+
+        Raises:
+            InputError: What lies there was not written by a batch: it is not replaced.
+        """
+        names = [path.name for path in self.final.iterdir()] if self.final.is_dir() else []
+        foreign = any(name[0] != "." for name in names) and not {DONE, FAILED, LOG} & set(names)
+        if foreign or (self.final.exists() and not self.final.is_dir()):
+            raise InputError(f"{self.final}: holds no results of a batch, and is not replaced; choose another --out")
+        if (self.final / DONE).is_file():
+            shutil.rmtree(self.old, ignore_errors=True)
+
     def finish(self) -> None:
         """Give the folder at work its name, in place of an older one."""
         shutil.rmtree(self.old, ignore_errors=True)
@@ -73,7 +94,7 @@ class Place:
         """Only one process works on a scene; the lock ends with its process.
 
         Raises:
-            InputError: Another one holds it.
+            Held: Another one has it.
         """
         import fcntl
 
@@ -88,7 +109,7 @@ class Place:
             except BlockingIOError:
                 if time.monotonic() > end:
                     os.close(handle)
-                    raise InputError(f"{self.final}: another process works on it; wait until it has ended") from None
+                    raise Held(f"{self.final}: another process works on it; wait until it has ended") from None
                 time.sleep(0.1)
             os.close(handle)
         try:
@@ -176,3 +197,27 @@ def unchanged(inputs: dict[str, Any], paths: tuple[str, ...]) -> bool:
     except (InputError, KeyError, TypeError):
         return False
     return True
+
+
+def check_apart(tasks: Iterable[Task], out: Path, names: Set[str]) -> None:
+    """Refuse results that would replace what they are made from, or lie in it.
+
+    Args:
+        tasks: With their inputs.
+        out: Folder of all results.
+        names: Of all scenes of the list.
+
+    Raises:
+        InputError: An input lies in a folder of results, or the folder of results in an input.
+    """
+    results = out.resolve()
+    for task in tasks:
+        for source in map(Path, task.inputs):
+            place = source.resolve()
+            if place == results or place in results.parents:
+                raise InputError(f"--out {out}: lies in {source}, which scene {task.name} reads; choose another folder")
+            if results in place.parents and place.relative_to(results).parts[0] in names:
+                raise InputError(
+                    f"--out {out}: scene {task.name} reads {source}, which its results would replace; choose another "
+                    "folder, or add stages to --do of the batch that wrote it"
+                )

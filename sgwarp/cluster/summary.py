@@ -13,6 +13,7 @@ from sgwarp.cluster.tasks import Outcome
 from sgwarp.files.atomic import atomic_path
 
 SHOWN = 20  # failures in the printed table
+SIZES = ("gaussians", "views")
 
 
 @dataclass
@@ -76,10 +77,11 @@ def write_table(outcomes: Sequence[Outcome], path: Path) -> None:
     with atomic_path(path) as temporary, temporary.open("w", newline="", encoding="utf-8") as file:
         writer = csv.writer(file, lineterminator="\n")
         heads = [f"{stage} [s]" for stage in stages] + [f"{stage} {name}" for stage, name in figures]
-        writer.writerow(["scene", "status", *heads, "peak memory [bytes]", "error"])
+        writer.writerow(["scene", "status", *heads, *SIZES, "peak memory [bytes]", "error"])
         for outcome in sorted(outcomes, key=lambda found: found.name):
             cells = [outcome.seconds.get(stage, "") for stage in stages]
             cells += [outcome.figures.get(stage, {}).get(name, "") for stage, name in figures]
+            cells += [outcome.size.get(what, "") for what in SIZES]
             writer.writerow([outcome.name, outcome.status, *cells, outcome.peak_memory or "", outcome.error])
 
 

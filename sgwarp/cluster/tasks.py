@@ -9,7 +9,7 @@ from typing import Any, Literal, TypeAlias
 
 OUT = "{out}"  # in arguments: the folder that a scene is worked on in
 
-Status: TypeAlias = Literal["done", "skipped", "failed"]
+Status: TypeAlias = Literal["done", "skipped", "failed", "held"]
 
 
 @dataclass(frozen=True)
@@ -52,6 +52,9 @@ class Task:
         limits: What the scene may take.
         common: Arguments of every stage that do not change the results, such as the number of threads.
         retry: Try again what failed in an earlier run.
+        measure: "module:function" that says how large a scene was: `measure(stages) -> {"gaussians": N, "views": V}`,
+            given the arguments by stage with `OUT` replaced; nothing is measured if empty.
+        fault: Why nothing can be done with this scene, found before the start; recorded when it is its turn.
     """
 
     name: str
@@ -63,6 +66,8 @@ class Task:
     limits: Limits = Limits()
     common: tuple[str, ...] = ()
     retry: bool = False
+    measure: str = ""
+    fault: str = ""
 
     @property
     def options(self) -> dict[str, list[str]]:
@@ -85,11 +90,12 @@ class Outcome:
 
     Attributes:
         name: Of the scene.
-        status: "skipped" if it was done before.
+        status: "skipped" if it was done before, "held" if another process is at it.
         error: One line, if it failed.
         seconds: By stage; empty if it failed.
         peak_memory: Resident bytes, of the scene.
         figures: The error figures of its commands, by stage.
+        size: How many Gaussians and views, as far as they are known.
     """
 
     name: str
@@ -98,6 +104,7 @@ class Outcome:
     seconds: dict[str, float] = field(default_factory=dict)
     peak_memory: int = 0
     figures: dict[str, dict[str, Any]] = field(default_factory=dict)
+    size: dict[str, int] = field(default_factory=dict)
 
 
 Engine: TypeAlias = Callable[[Iterable[Task]], Iterator[Outcome]]  # outcomes come as scenes end, in any order

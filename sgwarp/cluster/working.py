@@ -13,14 +13,24 @@ from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any
 
-from sgwarp.cluster.records import DONE, FAILED, STAGES, Place, fingerprint, read_json, unchanged, write_json
+from sgwarp.cluster.records import (
+    DONE,
+    FAILED,
+    LOG,
+    STAGES,
+    Held,
+    Place,
+    fingerprint,
+    read_json,
+    unchanged,
+    write_json,
+)
 from sgwarp.cluster.tasks import OUT, Outcome, Task, named_function
 from sgwarp.cluster.watching import watched
 from sgwarp.errors import InputError, printable
 from sgwarp.runs.memory import peak
 from sgwarp.version import __version__
 
-LOG = "log.txt"  # what the commands of a scene have printed
 LONGEST = 1000  # characters of a recorded error
 
 
@@ -32,8 +42,8 @@ def settled(task: Task) -> Outcome | None:
         return Outcome(task.name, "failed", str(failed.get("error")))
     if failed and not task.retry and _same(failed, task):
         return Outcome(task.name, "failed", str(failed.get("error")))
-    if done and _same(done, task):
-        known = done.get("seconds", {}), done.get("peak_memory", 0), done.get("figures", {})
+    if done and _same(done, task) and not place.old.exists():
+        known = done.get("seconds", {}), done.get("peak_memory", 0), done.get("figures", {}), done.get("size", {})
         return Outcome(task.name, "skipped", "", *known)
     return None
 
@@ -49,8 +59,11 @@ def work(task: Task) -> Outcome:
     place = Place(Path(task.folder), task.name)
     try:
         with place.locked():
+            place.prepare()
             return settled(task) or _work(task, place)
-    except (InputError, OSError) as error:  # another process is at it, or the folder of results cannot be written
+    except Held as error:
+        return Outcome(task.name, "held", _line(error))
+    except (InputError, OSError) as error:  # the folder of results cannot be written
         return Outcome(task.name, "failed", _line(error))
 
 
@@ -65,22 +78,25 @@ def _work(task: Task, place: Place) -> Outcome:
     try:
         with watched(task.limits, fail):
             known["inputs"] = fingerprint(task.inputs, contents=True)
+            if task.fault:
+                raise InputError(task.fault)
             stages = _resumed(task, place, known["inputs"])
             with written_to(place.partial / LOG):
                 for stage in task.stages:
                     if stage.name not in stages:
                         stages[stage.name] = _do(task, place, stage.name, stage.arguments)
                         _write_stages(place, task, known["inputs"], stages)
+                size = _measure(task, place)
     except Exception as error:
         return fail(_line(error))
     seconds = {name: stages[name]["seconds"] for name in task.options}
     figures = {name: stages[name]["figures"] for name in task.options}
-    known |= {"seconds": seconds, "peak_memory": peak(), "figures": figures}
+    known |= {"seconds": seconds, "peak_memory": peak(), "figures": figures, "size": size}
     outputs = {name: stages[name]["outputs"] for name in task.options}
     write_json(place.partial / DONE, {**known, "outputs": outputs, "host": socket.gethostname()})
     (place.partial / STAGES).unlink(missing_ok=True)
     place.finish()
-    return Outcome(task.name, "done", "", seconds, known["peak_memory"], figures)
+    return Outcome(task.name, "done", "", seconds, known["peak_memory"], figures, size)
 
 
 def give_up(task: Task, line: str) -> Outcome:
@@ -93,6 +109,14 @@ def give_up(task: Task, line: str) -> Outcome:
     with suppress(InputError, OSError):  # without a record it is tried again in the next run
         place.fail({**record, "inputs": fingerprint(task.inputs, contents=True)})
     return Outcome(task.name, "failed", line)
+
+
+def _measure(task: Task, place: Place) -> dict[str, int]:
+    """How large the scene was."""
+    if not task.measure:
+        return {}
+    stages = {stage.name: [word.replace(OUT, str(place.partial)) for word in stage.arguments] for stage in task.stages}
+    return dict(named_function(task.measure)(stages))
 
 
 def _do(task: Task, place: Place, name: str, arguments: tuple[str, ...]) -> dict[str, Any]:

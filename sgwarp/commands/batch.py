@@ -20,9 +20,11 @@ from sgwarp.runs.progress import show_progress
 if TYPE_CHECKING:
     from sgwarp.cluster.listing import Scene
     from sgwarp.cluster.summary import Tally
-    from sgwarp.cluster.tasks import Engine, Task
+    from sgwarp.cluster.tasks import Engine, Stage, Task
+    from sgwarp.commands.scene_stages import Plan
 
 LOOKS = 16  # threads that look at what is done: network file systems answer slowly
+MEASURE = "sgwarp.commands.scene_size:measure"
 PREPARE = "sgwarp.commands.scene_stages:prepare"
 WARM = "sgwarp.commands.scene_stages:warm"
 
@@ -85,12 +87,16 @@ class Batch:
     def run(self) -> int:
         """Returns the exit code."""
         from sgwarp.cluster.listing import list_scenes, shard_of
+        from sgwarp.cluster.plot import write_plot
+        from sgwarp.cluster.records import check_apart
         from sgwarp.cluster.summary import Tally, table, write_table
 
         self._check()
-        scenes = list_scenes(self.scenes)
+        scenes = list_scenes(self.scenes, self.out)
         chosen = shard_of(scenes, self.shard) if self.shard is not None else scenes
         tasks = self._tasks(chosen)
+        check_apart(tasks, self.out, {scene.name for scene in scenes})
+        self.out.mkdir(parents=True, exist_ok=True)  # a system that refuses it does so before the work
         log = RunLog(command=self.command_line, device=self.device, threads=self._threads())
         tally = Tally()
         with log.stage("batch", wait=False):
@@ -98,13 +104,14 @@ class Batch:
         folder = self.out / "shards" / self.shard.replace("/", "-of-") if self.shard is not None else self.out
         folder.mkdir(parents=True, exist_ok=True)
         write_table(tally.outcomes, folder / "summary.csv")
+        pictures = write_plot(tally.outcomes, folder / "summary.png")
         for outcome in tally.outcomes:
             for stage, seconds in outcome.seconds.items() if outcome.status == "done" else ():
                 log.stages[stage] = log.stages.get(stage, 0.0) + seconds
         log.leave_out("scenes_done_before", tally.count("skipped"))
         log.error |= {"done": tally.count("done"), "failed": tally.count("failed")}
         log.outputs += [str(self.out / outcome.name) for outcome in tally.outcomes if outcome.status != "failed"]
-        log.outputs.append(str(folder / "summary.csv"))
+        log.outputs += [str(folder / "summary.csv"), *map(str, pictures)]
         log.write(folder)
         print(table(tally.outcomes))
         return 1 if tally.count("failed") else 0
@@ -129,7 +136,7 @@ class Batch:
     def _tasks(self, scenes: Iterable[Scene]) -> list[Task]:
         """Tasks of the scenes; bad options are found before anything is done."""
         from sgwarp.cluster.tasks import OUT, Limits, Task
-        from sgwarp.commands.scene_stages import Plan, parse, stages_of
+        from sgwarp.commands.scene_stages import Plan, parse
 
         pairs = [pair.partition("=") for pair in self.options]
         if wrong := [f"{key}{sign}{value}" for key, sign, value in pairs if not (key and sign)]:
@@ -138,14 +145,14 @@ class Batch:
         plan = Plan(tuple(filter(None, self.do.split(","))), options, self.device)
         limits = Limits(self.time_limit, None if self.memory_limit is None else int(self.memory_limit * 1e9))
         fixed: dict[str, Any] = {"folder": str(self.out.absolute()), "runner": "sgwarp.commands.scene_stages:run_stage"}
-        fixed |= {"run": secrets.token_hex(8), "limits": limits, "retry": self.retry_failed}
+        fixed |= {"run": secrets.token_hex(8), "limits": limits, "retry": self.retry_failed, "measure": MEASURE}
         common, tasks = ("--threads", str(self._threads())), []
         for scene in scenes:
-            stages, inputs = stages_of(scene, plan)
-            tasks.append(Task(name=scene.name, stages=stages, inputs=inputs, common=common, **fixed))
-        if tasks:
-            for stage in tasks[0].stages:
-                parse(stage.name, [word.replace(OUT, "out") for word in stage.arguments])
+            stages, inputs, fault = _stages_or_fault(scene, plan)
+            tasks.append(Task(scene.name, stages=stages, inputs=inputs, fault=fault, common=common, **fixed))
+        whole = next((task for task in tasks if not task.fault), None)
+        for stage in whole.stages if whole is not None else ():
+            parse(stage.name, [word.replace(OUT, "out") for word in stage.arguments])
         return tasks
 
     def _engine(self, tasks: list[Task]) -> Engine:
@@ -156,11 +163,21 @@ class Batch:
         encoder = options.get("lift.encoder", options.get("encoder", "conse"))
         warm = Call(WARM, (self.do.split(","), encoder, self.device)) if min(self.workers, len(tasks)) > 1 else None
         if self.engine == "local":
-            return LocalEngine(self.workers, Call(PREPARE), warm, environment)
+            return LocalEngine(self.workers, Call(PREPARE), warm, environment, self._devices())
         from sgwarp.cluster.ray_engine import RayEngine
 
         gpus = self.gpus if self.gpus is not None else float(self.device.startswith("cuda"))
         return RayEngine(self.workers, self._threads(), gpus, self.address, Call(PREPARE), warm, environment)
+
+    def _devices(self) -> tuple[str, ...]:
+        """CUDA devices that workers share out: with plain cuda and several workers those that this process sees."""
+        if self.device != "cuda" or self.workers == 1:
+            return ()
+        import torch
+
+        visible = os.environ.get("CUDA_VISIBLE_DEVICES")
+        named = visible.split(",") if visible is not None else map(str, range(torch.cuda.device_count()))
+        return tuple(name.strip() for name in named)
 
     def _do(self, tasks: list[Task], tally: Tally) -> None:
         """Fill the tally: with what is settled first, then with what the engine does."""
@@ -172,6 +189,24 @@ class Batch:
             tally.outcomes += [outcome for outcome in known if outcome is not None]
             before = len(tally.outcomes)
             waiting = [task for task, outcome in zip(tasks, known, strict=True) if outcome is None]
-            for outcome in self._engine(waiting)(waiting) if waiting else ():
-                tally.outcomes.append(outcome)
-                progress(len(tally.outcomes), len(tasks), tally.line(len(tasks), before))
+            by_name = {task.name: task for task in waiting}
+            while waiting:
+                held = []  # by another batch in the same folder: asked again after the others
+                for outcome in self._engine(waiting)(waiting):
+                    if outcome.status == "held":
+                        held.append(by_name[outcome.name])
+                        continue
+                    tally.outcomes.append(outcome)
+                    progress(len(tally.outcomes), len(tasks), tally.line(len(tasks), before))
+                waiting = held
+
+
+def _stages_or_fault(scene: Scene, plan: Plan) -> tuple[tuple[Stage, ...], tuple[str, ...], str]:
+    """Stages and inputs of a scene, and why there are none: a folder without Gaussians is that scene's fault alone."""
+    from sgwarp.cluster.listing import MissingScene
+    from sgwarp.commands.scene_stages import stages_of
+
+    try:
+        return *stages_of(scene, plan), ""
+    except MissingScene as error:
+        return (), (str(scene.path),), str(error)

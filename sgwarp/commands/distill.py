@@ -32,7 +32,8 @@ class Distill(Options):
     """
 
     scenes: tyro.conf.Positional[list[Path]]
-    """Scenes {name}.ply with {name}.safetensors beside each, which `sgwarp lift` wrote; or folders of them."""
+    """Scenes {name}.ply with {name}.safetensors beside each, which `sgwarp lift` wrote; folders of them; or the folder
+    of results of `sgwarp batch`, whose lifted scenes are taken."""
 
     out: Path
     """Network to write, .safetensors; its curves and run.json go beside it."""
@@ -64,7 +65,7 @@ class Distill(Options):
 
     loss: Literal["cosine", "contrastive"] = "cosine"
     """cosine: features of voxels against lifted ones, as in the paper; contrastive: rendered features against masks of
-    the views, which lie in the folder {name}/ beside {name}.ply."""
+    the views, which lie in the folder {name}/ beside {name}.ply, or where a batch found them."""
 
     encoder: str = "conse"
     """Encoder of the masks for the contrastive loss, the one that the scenes were lifted with; {views} stands for a
@@ -101,12 +102,15 @@ class Distill(Options):
 
         log = self.start()
         with joined(self.device) as processes:
+            from sgwarp.encoders.registry import keep_encoders
             from sgwarp.network.semantic_network import save_network
             from sgwarp.network.training.curves import write_curves
             from sgwarp.network.training.data import scenes_in
             from sgwarp.network.training.trainer import distill, state_path
 
             masks = self._masks_of if self.loss == "contrastive" else None
+            if masks is not None:
+                keep_encoders()  # one network for the masks of all scenes
             scenes, validation = scenes_in(self.scenes, masks), scenes_in(self.validation or [])
             settings = self._settings()
             with show_progress("distill") as progress:
@@ -152,14 +156,13 @@ class Distill(Options):
             seed=self.seed,
         )
 
-    def _masks_of(self, scene: Path) -> list[LoadMasks]:
-        """What loads the masks of each view beside a scene, in the order of the views."""
+    def _masks_of(self, folder: Path) -> list[LoadMasks]:
+        """What loads the masks of each view in a folder, in the order of the views."""
         from sgwarp.encoders.cache import default_folder
         from sgwarp.encoders.registry import make_encoder
         from sgwarp.io.views import load_views
         from sgwarp.network.training.contrastive import MaskedView
 
-        folder = scene.with_name(scene.name.removesuffix(".ply").removesuffix(".compressed"))
         views = load_views(folder, self.images)
         source = make_encoder(self.encoder.replace("{views}", str(folder)), views, self.device, default_folder())
         has_map = getattr(source, "has_map", lambda view: True)

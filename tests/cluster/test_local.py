@@ -3,6 +3,7 @@
 import hashlib
 import json
 import os
+import random
 import signal
 import subprocess
 import sys
@@ -169,3 +170,49 @@ def test_a_killed_driver_loses_nothing(batch):
     assert list(found.values()).count("skipped") >= 2
     assert batch.results() == expected(NAMES)
     assert batch.folders() == NAMES
+
+
+def test_workers_share_out_devices(batch):
+    """Each worker sees one CUDA device; a killed one's goes to the next."""
+    runner = batch.folder / "batch_runner.py"
+    seen = "    (out / 'device.bin').write_text(os.environ['CUDA_VISIBLE_DEVICES'])\n    time.sleep(seconds)"
+    runner.write_text(runner.read_text().replace("    time.sleep(seconds)", seen))
+    tasks = batch.slower(0.05).tasks()
+    killed = False
+    for _ in LocalEngine(2, devices=("3", "GPU-7"))(tasks):
+        if not killed and len(workers_of(os.getpid())) == 2:
+            os.kill(workers_of(os.getpid())[0], signal.SIGKILL)
+            killed = True
+    devices = [text.decode() for name, text in batch.results().items() if name.endswith("device.bin")]
+    assert len(devices) == 12
+    assert set(devices) == {"3", "GPU-7"}
+
+
+@needs_proc
+def test_random_kills_change_no_byte(batch):
+    """Workers and drivers are killed at random until all is done; every scene is there once, as if undisturbed."""
+    rng, killed = random.Random(1), {"driver": 0, "worker": 0}
+    tasks = batch.slower(0.1).tasks()
+    code = None
+    while code is None:
+        command = [sys.executable, "-c", DRIVER.format(paths=sys.path)]
+        with subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True) as driver:
+            driver.stdin.write(json.dumps([task.to_json() for task in tasks]))
+            driver.stdin.close()
+            while code is None and driver.stdout.readline():
+                time.sleep(rng.random() * 0.2)
+                workers = workers_of(driver.pid)
+                if killed["driver"] < 2 and rng.random() < 0.4:
+                    driver.kill()
+                    killed["driver"] += 1
+                    break
+                if workers and killed["worker"] < 4:
+                    os.kill(rng.choice(workers), signal.SIGKILL)
+                    killed["worker"] += 1
+            else:
+                code = driver.wait()
+    assert code == 0
+    assert killed == {"driver": 2, "worker": 4}
+    assert batch.results() == expected(NAMES)
+    assert batch.folders() == NAMES
+    assert set(batch.statuses(list(LocalEngine(1)(tasks))).values()) == {"skipped"}

@@ -2,13 +2,19 @@
 
 import json
 import shutil
+import signal
+import subprocess
+import sys
+import time
 
+import cv2
 import pytest
 
 from sgwarp.cli import main
 from sgwarp.cluster.listing import Scene
 from sgwarp.commands.scene_stages import Plan, parse, stages_of
 from sgwarp.errors import InputError
+from sgwarp.io.scenes import load_gaussians
 
 
 def run(*arguments) -> int:
@@ -143,3 +149,63 @@ def test_what_a_batch_lifted_is_what_it_evaluates(labeled, tmp_path):
     assert words[0] == "lerf-mask"
     assert words.count("--data") == 1
     assert "--semantics" not in words
+
+
+RUN = "import sys; from sgwarp.cli import main; sys.exit(main())"
+
+
+def test_an_interrupted_batch_goes_on(labeled, tmp_path, capsys):
+    """Ctrl-C, and what batch queues send: the workers end with the driver, and the next run does the rest."""
+    words = ["batch", labeled, "--do", "lift", "--out", tmp_path / "out", "--threads", "1", *OPTIONS[:2]]
+    records = []
+    for number, code, what in ((signal.SIGINT, 130, ".*.partial"), (signal.SIGTERM, 143, "[!.]*/done.json")):
+        started = subprocess.Popen([sys.executable, "-c", RUN, *map(str, words)], stderr=subprocess.PIPE)
+        end = time.monotonic() + 120
+        while not list((tmp_path / "out").glob(what)):
+            assert time.monotonic() < end
+            time.sleep(0.01)
+        started.send_signal(number)
+        said = started.communicate()[1].decode()
+        assert started.returncode in (0, code)  # 0 if the last scene ended meanwhile
+        assert "Traceback" not in said
+        records.append(list((tmp_path / "out").glob("[!.]*/done.json")))
+    assert main([*map(str, words)]) == 0
+    assert f"{len(records[-1])} skipped" in capsys.readouterr().out
+    assert sorted(path.parent.name for path in (tmp_path / "out").glob("[!.]*/done.json")) == ["one", "two"]
+    assert not list((tmp_path / "out").glob(".*.partial"))
+
+
+def test_a_folder_without_gaussians_fails_alone(scans, tmp_path, capsys):
+    """Names have spaces and letters of other languages; one of the scenes lacks its Gaussians."""
+    shutil.copytree(scans / "one", tmp_path / "scans" / "büro 東京")
+    (tmp_path / "scans" / "empty").mkdir()
+    out = tmp_path / "scans" / "results"
+    words = (tmp_path / "scans", "--do", "lift", "--out", out, "--threads", 1, *OPTIONS[:2])
+    assert run(*words) == 1
+    assert "1 done, 0 skipped, 1 failed scenes" in capsys.readouterr().out
+    assert "holds 0 scenes" in json.loads((out / "empty" / "failed.json").read_text())["error"]
+    views = len(json.loads((scans / "one" / "transforms.json").read_text())["frames"])
+    done = json.loads((out / "büro 東京" / "done.json").read_text())
+    assert done["size"] == {"gaussians": len(load_gaussians(scans / "one" / "scene.ply")), "views": views}
+    head, first, second = (out / "summary.csv").read_text().splitlines()
+    assert first.startswith("büro 東京,done")
+    assert second.startswith("empty,failed")
+    assert "gaussians,views" in head
+    assert cv2.imread(str(out / "summary.png")).shape[1] > 1000  # with a panel of who failed why
+    # The results lie beside the scenes, and are none themselves.
+    assert run(*words) == 1
+    assert "0 done, 1 skipped, 1 failed scenes" in capsys.readouterr().out
+
+
+def test_results_beside_their_inputs_are_refused(scans, tmp_path, capsys):
+    shutil.copytree(scans / "one", tmp_path / "scans" / "one")
+    before = sorted(path.name for path in (tmp_path / "scans" / "one").iterdir())
+    assert run(tmp_path / "scans", "--do", "fit", "--out", tmp_path / "scans", *OPTIONS[:0]) == 2
+    assert "which its results would replace" in capsys.readouterr().err
+    assert sorted(path.name for path in (tmp_path / "scans" / "one").iterdir()) == before
+
+
+@pytest.mark.skipif(not sys.platform.startswith("linux"), reason="uses /sys, where nobody can make folders")
+def test_a_folder_that_cannot_be_written_is_refused(scans, capsys):
+    assert run(scans, "--do", "lift", "--out", "/sys/results", *OPTIONS[:2]) == 2
+    assert "sys" in capsys.readouterr().err

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from functools import cache, partial
+from functools import lru_cache, partial
 from pathlib import Path
 
 import torch
@@ -14,10 +14,12 @@ from sgwarp.errors import InputError
 from sgwarp.network.augmentation import Augmentation
 from sgwarp.network.inputs import InputMode, voxelize
 from sgwarp.network.layers.sparse import SparseTensor
+from sgwarp.network.training.batches import Lifted, batch_results, is_batch
 from sgwarp.network.training.contrastive import MaskedView
 from sgwarp.scene import Gaussians, Semantics
 
 CHUNK = 65536  # Gaussians whose features are widened at once
+KEPT = 4  # scenes whose views and sources of masks stay: those of a step, not those of a data set
 LoadMasks = Callable[[], MaskedView]
 MasksOf = Callable[[Path], list[LoadMasks]]
 
@@ -37,23 +39,34 @@ def scenes_in(paths: Sequence[Path], masks: MasksOf | None = None) -> list[Train
     """Scenes {name}.ply with what `sgwarp lift` wrote for them, {name}.safetensors, beside each.
 
     Args:
-        paths: Scenes, or folders of them.
-        masks: Masks of the views of a scene, given its path, for the contrastive loss.
+        paths: Scenes, folders of them, or what `sgwarp batch` wrote: its folder of results, or that of one scene. Of
+            those the scenes count that are done.
+        masks: Masks of the views of a scene, given their folder, for the contrastive loss.
 
     Raises:
         InputError: A folder holds no scene, or a scene has no semantics beside it.
     """
-    found: list[Path] = []
+    found: list[Lifted] = []
     for path in paths:
-        inside = sorted(path.glob("*.ply")) if path.is_dir() else [path]
-        if not inside:
-            raise InputError(f"{path}: holds no scene .ply")
+        inside = batch_results(path) if path.is_dir() else []
+        if not inside and not is_batch(path):
+            inside = [_beside(ply) for ply in (sorted(path.glob("*.ply")) if path.is_dir() else [path])]
+            if not inside:
+                raise InputError(f"{path}: holds no scene .ply")
         found += inside
-    return [_scene(path, masks) for path in found]
+    if paths and not found:
+        raise InputError(f"{paths[0]}: no scene of this batch is done; see why in its summary.csv")
+    few = None if masks is None else lru_cache(KEPT)(masks)
+    return [_scene(lifted, few) for lifted in found]
 
 
-def _scene(path: Path, masks: MasksOf | None) -> TrainingScene:
-    semantics = path.with_name(path.name.removesuffix(".ply").removesuffix(".compressed") + ".safetensors")
+def _beside(path: Path) -> Lifted:
+    stem = path.with_name(path.name.removesuffix(".ply").removesuffix(".compressed"))
+    return Lifted(path, stem.with_name(f"{stem.name}.safetensors"), stem)
+
+
+def _scene(lifted: Lifted, masks: MasksOf | None) -> TrainingScene:
+    path, semantics = lifted.scene, lifted.semantics
     if not path.is_file():
         raise InputError(f"{path}: no such file; check the path")
     if not semantics.is_file():
@@ -68,7 +81,7 @@ def _scene(path: Path, masks: MasksOf | None) -> TrainingScene:
 
     files = (path, semantics)
     stamp = " ".join(f"{file.stat().st_size}:{file.stat().st_mtime_ns}" for file in files)
-    return TrainingScene(str(path), load, stamp, files, None if masks is None else cache(partial(masks, path)))
+    return TrainingScene(str(path), load, stamp, files, None if masks is None else partial(masks, lifted.views))
 
 
 @dataclass(frozen=True, eq=False)
