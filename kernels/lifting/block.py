@@ -1,9 +1,10 @@
 """Feature lifting, block schedule (CUDA): 256 threads own a tile; weights and features meet in shared memory.
 
 For a batch of 16 fragments each thread puts the weight of its own pixel into shared memory. Dense maps are then a
-product of 16 x 256 weights with 256 x 32 features: thread (row of pixels, 4 fragments, 8 channels) keeps 32 sums in
-registers, twelve reads for 32 multiplications, and the sums of the 16 rows are added up in two steps. Id maps are sums
-of a row of pixels, which go to one id where the whole row shows it.
+product of 16 x 256 weights with 256 x 64 features (32 where a map has no more): a warp takes its own 32 pixels, a
+thread 4 fragments and 8 channels. It keeps 32 sums in registers, three reads of four floats for 32 multiplications, and
+the sums of the eight warps are added up in three steps. Id maps are sums of a row of pixels, which go to one id where
+the whole row shows it.
 
 A sum goes to the Gaussian by one atomic addition per (tile, fragment, channel) or, in the ordered variant, to the row
 of its place in the lists; `shared.sum_rows` adds the rows up in a fixed order. A block ends when all its pixels are
@@ -24,21 +25,34 @@ from sgwarp.kernels.transmittance import BLOCK_OPTIONS, LANES, attenuated, contr
 wp.set_module_options(BLOCK_OPTIONS)
 
 BATCH = LANES  # fragments whose weights meet the features at a time
-CHANNELS = 2 * LANES  # that a block lifts
+WARP = 32  # threads, and pixels whose products one of them sums
+CHANNELS, WIDE_CHANNELS = 2 * LANES, 4 * LANES  # that a block lifts
 FRAGMENTS = 4  # that a thread multiplies by
-EIGHT = 8  # channels
-Products = wp.types.vector(length=FRAGMENTS * EIGHT, dtype=wp.float32)
-WEIGHTS = BLOCK + 1  # floats between the weights of two fragments (dense)
-PIXELS = BLOCK + 4  # floats between two channels
-ROW_SUMS = BATCH * (CHANNELS + 1)  # floats between the sums of two rows of pixels
+WEIGHTS = BATCH + 4  # floats between the weights of two pixels (dense)
 PADDED_ROW = TILE + 1  # floats between two rows of weights (ids)
 FRAGMENT = TILE * PADDED_ROW
 
 
+@wp.func
+def four_floats(values: wp.tile[float], first: int) -> wp.vec4:
+    """Four neighbors in shared memory; one read where `first` is a multiple of four."""
+    a = wp.tile_extract(values, first)
+    b = wp.tile_extract(values, first + 1)
+    c = wp.tile_extract(values, first + 2)
+    d = wp.tile_extract(values, first + 3)
+    return wp.vec4(a, b, c, d)
+
+
 @cache
-def make_lift_dense_block(ordered: bool, squared: bool = False) -> wp.Kernel:
+def make_lift_dense_block(ordered: bool, squared: bool = False, wide: bool = True) -> wp.Kernel:
     """Kernel that lifts a dense map: atomic additions, or one row for each place if `ordered`; with weight alpha T, or
-    its square."""
+    its square; 64 channels a block, or 32 unless `wide`."""
+    channels_of_block = WIDE_CHANNELS if wide else CHANNELS
+    quads = channels_of_block // 4
+    halves = quads // 8  # vectors of channels that a thread multiplies
+    per_fragment = 4 * halves
+    Products = wp.types.vector(length=FRAGMENTS * per_fragment, dtype=wp.float32)
+    sums_of_warp = BATCH * channels_of_block
 
     @wp.kernel(module="unique", module_options=BLOCK_OPTIONS, enable_backward=False)
     def lift_dense_block(
@@ -58,7 +72,7 @@ def make_lift_dense_block(ordered: bool, squared: bool = False) -> wp.Kernel:
         sums_out: wp.array2d[float],  # [N, C] added to, or [I, C of this pass] by place
         weights_out: wp.array[float],  # [N] added to, or [I] by place; written by the first blocks of a pass
     ):
-        """A^T f; one block per (tile, 32 channels)."""
+        """A^T f; one block per (tile, 64 channels)."""
         tile, part, t = wp.tid()
         columns = (width + TILE - 1) / TILE
         x0 = (tile % columns) * TILE
@@ -70,22 +84,26 @@ def make_lift_dense_block(ordered: bool, squared: bool = False) -> wp.Kernel:
         if x < width and y < height:
             T = float(1.0)
             seen = valid[y, x]
-        pixels = wp.tile_empty(shape=(wp.static(CHANNELS * PIXELS),), dtype=float, storage="shared")
-        for k in range(t, wp.static(CHANNELS * BLOCK), BLOCK):
-            c = k % CHANNELS
-            p = k / CHANNELS
+        base = channels_of_block * part
+        c = t % channels_of_block
+        pixels = wp.tile_empty(shape=(wp.static(channels_of_block * BLOCK),), dtype=float, storage="shared")
+        for p in range(t / channels_of_block, BLOCK, wp.static(BLOCK // channels_of_block)):
             value = float(0.0)
             inside = x0 + p % TILE < width and y0 + p / TILE < height
-            if inside and CHANNELS * part + c < channels:
-                value = features[y0 + p / TILE, x0 + p % TILE, first_feature + CHANNELS * part + c]
-            put(pixels, PIXELS * c + p, value)
-        # Weights of a batch, then sums of rows of pixels.
-        shares = wp.tile_empty(shape=(wp.static(LANES // 2 * ROW_SUMS),), dtype=float, storage="shared")
+            if inside and base + c < channels:
+                value = features[y0 + p / TILE, x0 + p % TILE, first_feature + base + c]
+            put(pixels, channels_of_block * p + c, value)
+        # Weights of a batch, pixel by pixel, then the sums of four warps.
+        shares = wp.tile_empty(
+            shape=(wp.static(max(WEIGHTS * BLOCK, 4 * sums_of_warp)),), dtype=float, storage="shared"
+        )
         totals = wp.tile_empty(shape=(wp.static(BATCH * PADDED_ROW),), dtype=float, storage="shared")
         still_open = wp.tile_zeros(shape=(2,), dtype=float, storage="shared")
         row = t / TILE
-        quad = FRAGMENTS * ((t % TILE) / 4)  # first of a thread's four fragments
-        c0 = t % 4  # first of its channels, of which every fourth is its own
+        warp = t / WARP
+        four = (t % WARP) / 8  # which four fragments are a thread's
+        quad = t % 8  # which channels: these four, and as many 32 channels further on
+        mine = wp.static(sums_of_warp) * (warp % 4) + wp.static(channels_of_block * FRAGMENTS) * four + 4 * quad
         first = offsets[tile]
         last = offsets[tile + 1]
         stop = last  # where no pixel is open any more
@@ -95,13 +113,18 @@ def make_lift_dense_block(ordered: bool, squared: bool = False) -> wp.Kernel:
             # The barriers of these loads keep readers of the last batch and writers of this one apart.
             ranks = wp.tile_load(listed, shape=BATCH, offset=start, storage="shared")
             staged = wp.tile_load_indexed(splats, indices=ranks, shape=(BATCH,), storage="shared")
-            for b in range(size):
-                alpha = alpha_at(wp.tile_extract(staged, b), x, y, knobs)
-                weight = contribution(alpha, T, knobs)
-                if wp.static(squared):
-                    weight *= weight
-                put(shares, WEIGHTS * b + t, weight * seen)
-                T = attenuated(alpha, T, knobs)
+            # Up to three fragments behind the tile's last go along; nobody reads what they add up to.
+            for b in range(0, size, FRAGMENTS):
+                weights = wp.vec4(0.0, 0.0, 0.0, 0.0)
+                for a in range(FRAGMENTS):
+                    alpha = alpha_at(wp.tile_extract(staged, b + a), x, y, knobs)
+                    weight = contribution(alpha, T, knobs)
+                    if wp.static(squared):
+                        weight *= weight
+                    weights[a] = weight * seen
+                    T = attenuated(alpha, T, knobs)
+                for a in range(FRAGMENTS):
+                    put(shares, WEIGHTS * t + b + a, weights[a])
             if T > 0.0:
                 put(still_open, turn, 1.0)
             barrier()
@@ -110,40 +133,43 @@ def make_lift_dense_block(ordered: bool, squared: bool = False) -> wp.Kernel:
             if part == 0:
                 weight = float(0.0)
                 for i in range(TILE):
-                    weight += wp.tile_extract(shares, WEIGHTS * (t % TILE) + TILE * row + i)
+                    weight += wp.tile_extract(shares, WEIGHTS * (TILE * row + i) + t % TILE)
                 put(totals, PADDED_ROW * (t % TILE) + row, weight)
             products = Products(0.0)
-            for p in range(TILE * row, TILE * row + TILE):
-                for a in range(FRAGMENTS):
-                    w = wp.tile_extract(shares, WEIGHTS * (quad + a) + p)
-                    for e in range(EIGHT):
-                        value = wp.tile_extract(pixels, PIXELS * (4 * e + c0) + p)
-                        products[EIGHT * a + e] = products[EIGHT * a + e] + w * value
+            for p4 in range(WARP * warp, WARP * warp + WARP, 4):
+                for k in range(4):
+                    w = four_floats(shares, WEIGHTS * (p4 + k) + FRAGMENTS * four)
+                    for h in range(halves):
+                        f = four_floats(pixels, channels_of_block * (p4 + k) + 32 * h + 4 * quad)
+                        for a in range(FRAGMENTS):
+                            for e in range(4):
+                                place = per_fragment * a + 4 * h + e
+                                products[place] = products[place] + w[a] * f[e]
             barrier()
-            mine = ROW_SUMS * (row % 8) + (CHANNELS + 1) * quad + c0
-            if row >= 8:
+            if warp >= 4:
                 for a in range(FRAGMENTS):
-                    for e in range(EIGHT):
-                        put(shares, mine + (CHANNELS + 1) * a + 4 * e, products[EIGHT * a + e])
+                    for h in range(halves):
+                        for e in range(4):
+                            at = mine + channels_of_block * a + 32 * h + e
+                            put(shares, at, products[per_fragment * a + 4 * h + e])
             barrier()
-            if row < 8:
+            if warp < 4:
                 for a in range(FRAGMENTS):
-                    for e in range(EIGHT):
-                        place = mine + (CHANNELS + 1) * a + 4 * e
-                        put(shares, place, products[EIGHT * a + e] + wp.tile_extract(shares, place))
+                    for h in range(halves):
+                        before = four_floats(shares, mine + channels_of_block * a + 32 * h)
+                        for e in range(4):
+                            at = mine + channels_of_block * a + 32 * h + e
+                            put(shares, at, products[per_fragment * a + 4 * h + e] + before[e])
             barrier()
-            for o in range(t, wp.static(CHANNELS * BATCH), BLOCK):
-                j = o / CHANNELS
-                c = o % CHANNELS
-                if j < size and CHANNELS * part + c < channels:
+            if base + c < channels:
+                for j in range(t / channels_of_block, size, wp.static(BLOCK // channels_of_block)):
                     total = float(0.0)
-                    for i in range(8):
-                        total += wp.tile_extract(shares, ROW_SUMS * i + (CHANNELS + 1) * j + c)
+                    for i in range(4):
+                        total += wp.tile_extract(shares, wp.static(sums_of_warp) * i + channels_of_block * j + c)
                     if wp.static(ordered):
-                        sums_out[start + j, CHANNELS * part + c] = total
+                        sums_out[start + j, base + c] = total
                     else:
-                        gaussian = wp.tile_extract(staged, j).gaussian
-                        wp.atomic_add(sums_out, gaussian, first_channel + CHANNELS * part + c, total)
+                        wp.atomic_add(sums_out, wp.tile_extract(staged, j).gaussian, first_channel + base + c, total)
             if part == 0 and t < size:
                 weight = float(0.0)
                 for i in range(TILE):
@@ -157,8 +183,8 @@ def make_lift_dense_block(ordered: bool, squared: bool = False) -> wp.Kernel:
                 break
         if wp.static(ordered):
             for k in range(stop + t, last, BLOCK):
-                for c in range(CHANNELS * part, wp.min(CHANNELS * (part + 1), channels)):
-                    sums_out[k, c] = 0.0
+                for e in range(base, wp.min(base + channels_of_block, channels)):
+                    sums_out[k, e] = 0.0
                 if part == 0:
                     weights_out[k] = 0.0
 

@@ -38,14 +38,15 @@ def cuda_kernels() -> list[wp.Kernel]:
             kernels += [
                 k for k in vars(module).values() if isinstance(k, wp.Kernel) and k.module.name == module.__name__
             ]
+    pairs = list(itertools.product((False, True), repeat=2))
     for flag in (False, True):
         kernels += [compositing_block.make_composite_colors_block(depth, flag) for depth in (False, True)]
         kernels.append(compositing_block.make_composite_features_block(flag))
-        kernels += [lifting_block.make_lift_dense_block(flag, squared) for squared in (False, True)]
+        kernels += [lifting_block.make_lift_dense_block(flag, squared, wide) for squared, wide in pairs]
         kernels += [lifting_block.make_lift_ids_block(flag, squared) for squared in (False, True)]
         kernels.append(pixel_lists.make_list_contributors(flag))
         kernels.append(voxels.make_list_pairs(flag))
-    for wide, ordered in itertools.product((False, True), repeat=2):
+    for wide, ordered in pairs:
         # The options go together here: each adds its own lines to a kernel, and together they need most registers.
         kernels.append(compositing_block_backward.make_composite_backward_block(wide, ordered, ordered, ordered))
     return kernels

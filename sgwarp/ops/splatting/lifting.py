@@ -173,10 +173,10 @@ def _add_dense_pass(
         inputs = [*lists.arrays(), view(features.flatten(2), wp.float32), view(valid, wp.float32)]
         inputs += [LANE * first_feature, LANE * first, LANE * count, knobs, width, height]
         outputs = [view(target.flatten(1), wp.float32), view(of_fragments, wp.float32)]
-        grid = [lists.tile_count, -(-LANE * count // lifting_block.CHANNELS)]
-        launch_blocks(
-            lifting_block.make_lift_dense_block(way.ordered, way.squared), grid, inputs, outputs, device=device
-        )
+        wide = LANE * count > lifting_block.CHANNELS
+        per_block = lifting_block.WIDE_CHANNELS if wide else lifting_block.CHANNELS
+        kernel = lifting_block.make_lift_dense_block(way.ordered, way.squared, wide)
+        launch_blocks(kernel, [lists.tile_count, -(-LANE * count // per_block)], inputs, outputs, device=device)
         if not way.ordered:
             if first == 0:
                 _fold(of_fragments, sums)
