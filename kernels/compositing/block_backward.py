@@ -3,8 +3,9 @@
 The mathematics is that of `lanes_backward.py`. For a batch of 16 fragments
 
 1. each thread computes w and g at its own pixel, and puts them into shared memory;
-2. thread (fragment, column of pixels) sums g, d g, d^2 g and w v over the 16 pixels, d their row counted from the
-   middle of the tile: down a column u and v change by b and c, so that the six moments follow from these three;
+2. thread (fragment, column of pixels) sums g, d g, d^2 g and w v over the 16 pixels, d their row counted from where the
+   fragment is strongest: down a column u and v change by b and c, so that the six moments follow from these three.
+   Counted from anywhere else the three would be large and the moments small differences of them;
 3. thread (fragment, column of the result) adds the 16 sums up.
 
 The sum goes to the Gaussian by one atomic addition per (tile, fragment, column) or, in the ordered variant, to the row
@@ -34,7 +35,6 @@ SUMS = BLOCK + 1  # floats between two columns of the partial sums
 HALF = 8  # fragments whose features meet the pixels' gradients at a time
 Half = wp.types.vector(length=HALF, dtype=wp.float32)
 QUADS = BLOCK // HALF  # groups of four channels that are staged at a time
-MIDDLE = 0.5 * (TILE - 1)
 BLOCKS = 3  # that a multiprocessor should hold: no more than 80 registers
 
 
@@ -161,21 +161,25 @@ def make_composite_backward_block(wide: bool, depth: bool, absolute: bool, order
             barrier()
             if j < size:
                 f = wp.tile_extract(staged, j)
-                dy = float(y0) + (MIDDLE + 0.5) - f.mean[1]
-                u = f.a * (float(x0 + q) + 0.5 - f.mean[0]) + f.b * dy  # at the middle of the column
+                across = f.a * (float(x0 + q) + 0.5 - f.mean[0])
+                top = float(y0) + 0.5 - f.mean[1]
+                steep = f.b * f.b + f.c * f.c
+                middle = wp.clamp(-top - f.b * across * reciprocal(steep), 0.0, wp.static(float(TILE - 1)))
+                dy = top + middle
+                u = across + f.b * dy
                 v = f.c * dy
                 slope = f.b * u + f.c * v
-                steep = f.b * f.b + f.c * f.c
                 g0 = float(0.0)
                 g1 = float(0.0)
                 g2 = float(0.0)
                 sums = Row(0.0)
                 for i in range(TILE):
-                    d = float(i) - MIDDLE
+                    d = float(i) - middle
                     g = wp.tile_extract(shares, PIXELS * j + TILE * i + q)
                     g0 += g
-                    g1 += d * g
-                    g2 += (d * d) * g
+                    dg = d * g
+                    g1 += dg
+                    g2 += d * dg
                     if wp.static(valued > 0):
                         w = wp.tile_extract(shares, PIXELS * (BATCH + j) + TILE * i + q)
                         for c in range(valued):

@@ -246,8 +246,7 @@ def test_block_schedule_equals_lane_schedule(scene, deterministic):
             loss = Loss.random(raster)
             loss(ours(leaves, camera, settings, absgrad=True, **options)).backward()
             results.append({**leaves.gradients(), "absgrad": leaves.tensors["means2d"].absgrad})
-        # Both may differ from the oracle by 1e-3; where a sum nearly cancels, each rounds its own way.
-        assert_rows_close(results[1], results[0], tolerance=2e-3)
+        assert_rows_close(results[1], results[0])
 
 
 def test_same_bits_for_any_number_of_threads(make_scene, monkeypatch):
