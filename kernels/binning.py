@@ -303,7 +303,8 @@ def emit_tiles(
     """List the tiles of each splat, row by row (CUDA)."""
     k = wp.tid()
     entry = entries[k]
-    if entries[k + 1] == entry:
+    stop = entries[k + 1]
+    if stop == entry:
         return
     columns = (width + TILE - 1) / TILE
     splat = splats[k]
@@ -311,7 +312,8 @@ def emit_tiles(
     first_row, last_row = tile_rows(splat, height)
     for row in range(first_row, last_row + 1):
         first, last = row_columns(splat, row, width, box_first, box_last)
-        for column in range(first, last + 1):
+        # Where the lists were given too little room, `stop` comes before the last tile.
+        for column in range(first, wp.min(last, first + stop - entry - 1) + 1):
             tiles_out[entry] = row * columns + column
             intersections_out[entry] = entry
             ranks_out[entry] = k

@@ -47,6 +47,7 @@ if TYPE_CHECKING:
     from sgwarp.ops.splatting.autograd import rasterize as rasterize
     from sgwarp.ops.splatting.contributors import top_contributors as top_contributors
     from sgwarp.ops.splatting.plan import RenderPlan as RenderPlan
+    from sgwarp.ops.splatting.room import ListRoom as ListRoom
     from sgwarp.ops.splatting.settings import RasterSettings as RasterSettings
     from sgwarp.querying.scores import evidence as evidence
     from sgwarp.querying.scores import query as query
@@ -88,6 +89,7 @@ _HOME = {
     "InstanceMap": "sgwarp.scene",
     "InstanceSettings": "sgwarp.apps.instances.settings",
     "LiftSettings": "sgwarp.lifting.settings",
+    "ListRoom": "sgwarp.ops.splatting.room",
     "RasterSettings": "sgwarp.ops.splatting.settings",
     "RenderPlan": "sgwarp.ops.splatting.plan",
     "RunLog": "sgwarp.runs.log",

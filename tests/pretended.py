@@ -47,6 +47,7 @@ WAITS = {
 }
 INDEXING = {aten.index, aten.index_put, aten.index_put_, aten._index_put_impl_}
 CROSSING = INDEXING | {aten.copy_, aten._copy_from}  # may take a tensor of each device
+ALLOCATIONS = ("empty", "empty_like", "empty_strided", "new_empty")  # launch nothing either, but are counted as calls
 HOST = {aten.detach, aten.alias, aten.view, aten.lift_fresh, aten._unsafe_view}  # launch nothing
 
 
@@ -156,6 +157,11 @@ class PretendedDevice:
         self.stream = TorchStream(0)
         self.sorting_on: PretendedStream | None = None
         self._recent = False  # whether the latest operation on tensors was one on the device
+
+    @property
+    def work(self) -> int:
+        """Launches, and operations of torch that run something: each takes one launch at least."""
+        return len(self.launches) + sum(count for name, count in self.calls.items() if name not in ALLOCATIONS)
 
     def reset(self) -> None:
         """Forget what happened."""

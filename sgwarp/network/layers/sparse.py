@@ -143,17 +143,21 @@ class Linear(nn.Module):
 
 
 class BatchNorm(nn.Module):
-    """Batch normalisation over all voxels; with fewer than two, which have no variance, by the running statistics."""
+    """Batch normalisation over all voxels; with fewer than two, which have no variance, by the running statistics.
+
+    The network counts the batches, for all its layers at once.
+    """
 
     def __init__(self, channels: int) -> None:
         super().__init__()
         self.bn = nn.BatchNorm1d(channels)
 
     def forward(self, x: SparseTensor) -> SparseTensor:
-        if len(x.features) > 1:
-            return x.with_features(self.bn(x.features))
         bn = self.bn
-        y = nn.functional.batch_norm(x.features, bn.running_mean, bn.running_var, bn.weight, bn.bias, eps=bn.eps)
+        learns = self.training and len(x.features) > 1
+        y = nn.functional.batch_norm(
+            x.features, bn.running_mean, bn.running_var, bn.weight, bn.bias, learns, bn.momentum, bn.eps
+        )
         return x.with_features(y)
 
 

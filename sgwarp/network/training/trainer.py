@@ -141,9 +141,13 @@ class _Run:
             torch.manual_seed(s.seed)
             net = MinkUNet(INPUT_CHANNELS[s.inputs], channels, s.arch).to(self.device)
         self.network = SemanticNetwork(net, s.inputs, s.voxel, space, labels)
-        for parameter in net.parameters():  # processes add up the gradients of all, also of a process without a target
-            parameter.grad = torch.zeros_like(parameter)
-        self.optimizer = torch.optim.AdamW(net.parameters(), lr=s.learning_rate, weight_decay=s.weight_decay)
+        rates = {"lr": s.learning_rate, "weight_decay": s.weight_decay}
+        self.optimizer = torch.optim.AdamW(net.parameters(), **rates, fused=self._fused)
+
+    @property
+    def _fused(self) -> bool | None:
+        """Whether the optimizer takes its step in one launch for all parameters: on CUDA; on the CPU torch decides."""
+        return True if self.device.type == "cuda" else None
 
     def start_from(self, weights: dict[str, Tensor] | str | os.PathLike[str]) -> None:
         """Take these weights instead of random ones."""
@@ -198,11 +202,10 @@ class _Run:
         """
         net = self.network.net
         figures = torch.zeros(2, dtype=torch.float64, device=self.device)
-        gradients = [p.grad for p in net.parameters() if p.grad is not None]
         statistics = [buffer for buffer in net.buffers() if buffer.is_floating_point()]
         before = [buffer.clone() for buffer in statistics]
         sums = [torch.zeros_like(buffer) for buffer in statistics]
-        self.optimizer.zero_grad(set_to_none=False)
+        self.optimizer.zero_grad()
         for index in chosen[self.processes.rank :: self.processes.count]:
             with self.log.stage("prepare"):
                 generator = _generator(self.settings.seed, epoch, index)
@@ -226,6 +229,11 @@ class _Run:
             )
         if count:
             with self.log.stage("train"):
+                # Processes add up the gradients of all, also of one without a target.
+                for parameter in net.parameters():
+                    if parameter.grad is None:
+                        parameter.grad = torch.zeros_like(parameter)
+                gradients = [p.grad for p in net.parameters() if p.grad is not None]
                 self.processes.add_up([*gradients, *sums])
                 torch._foreach_div_([*gradients, *sums], count)
                 torch._foreach_copy_(statistics, sums)
@@ -329,6 +337,8 @@ class _Run:
                     f"{path}: is of a run with another {changed[0]} ({values}); remove it, or ask for the same"
                 )
             self.network.net.load_state_dict(content["net"])
+            for group in content["optimizer"]["param_groups"]:
+                group["fused"] = self._fused  # of this device, not of the one that wrote the state
             self.optimizer.load_state_dict(content["optimizer"])
             self.history = [Epoch(**epoch) for epoch in content["history"]]
         except InputError:

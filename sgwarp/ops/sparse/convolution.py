@@ -109,7 +109,7 @@ def _weight_gradient_in_blocks(features: Tensor, grad: Tensor, kernel_map: Kerne
     offsets, channels = kernel_map.offsets, convolution_block.CHANNELS
     squares = -(-features.shape[1] // channels) * -(-grad.shape[1] // channels)
     shares = max(1, min(BUSY_BLOCKS // (offsets * squares), MAX_SHARES))
-    v_weight = torch.zeros(shares, offsets, features.shape[1], grad.shape[1], device=features.device)
+    v_weight = torch.empty(shares, offsets, features.shape[1], grad.shape[1], device=features.device)
     pairs = [view(t, wp.int64) for t in (kernel_map.sources, kernel_map.targets)]
     inputs = [view(t.to(torch.float32), wp.float32) for t in (features, grad)]
     inputs += [*pairs, view(kernel_map.starts_on_device, wp.int32)]

@@ -13,6 +13,7 @@ from sgwarp.ops.planar.harmonics import harmonic_colors
 from sgwarp.ops.splatting import backward, forward, tiles
 from sgwarp.ops.splatting.forward import Rendering, composite_recorded, packed_colors, require_finite_features
 from sgwarp.ops.splatting.plan import RenderPlan, plan_render
+from sgwarp.ops.splatting.room import ListRoom
 from sgwarp.ops.splatting.settings import RasterSettings
 from sgwarp.runs.isolation import uncompiled
 from sgwarp.scene import SH_COUNTS, Camera, Gaussians
@@ -42,6 +43,7 @@ def rasterize(
     settings: RasterSettings = RasterSettings(),  # noqa: B008 - frozen
     schedule: str | None = None,
     deterministic: bool | None = None,
+    room: ListRoom | None = None,
 ) -> Rendering:
     """Render a view (paper eq. 1) with gradients to every tensor but K.
 
@@ -72,6 +74,7 @@ def rasterize(
         settings: The approximations.
         schedule: "lanes" or "block", by default the device's own; either runs on the CPU.
         deterministic: Add gradients up in a fixed order. The CPU always does; on CUDA the default is atomic additions.
+        room: For the tile lists: with it nobody waits for their length on CUDA, and a CUDA graph can hold the call.
 
     Raises:
         InputError: Shapes do not fit, or the camera is not valid; on the CPU also: a scale is negative or an opacity
@@ -136,6 +139,7 @@ def rasterize(
             depth=depth,
             settings=settings,
             look=not means.is_cuda,
+            room=room,
         )
     receives_absgrad = means2d if absgrad else None
     plan = plan_render(
@@ -147,7 +151,7 @@ def rasterize(
         settings=settings,
         look=False,
     )
-    request = _Request(camera, settings, plan, receives_absgrad, schedule, deterministic)
+    request = _Request(camera, settings, plan, receives_absgrad, schedule, deterministic, room)
     means, quats, scales, opacities, values = (
         t.to(torch.float32).contiguous() for t in (means, quats, scales, opacities, values)
     )
@@ -203,6 +207,7 @@ class _Request:
     receives_absgrad: Tensor | None
     schedule: str | None
     deterministic: bool | None
+    room: ListRoom | None
     status_counts: Tensor = field(default_factory=lambda: torch.empty(0, dtype=torch.int64, device="cpu"))
 
     @property
@@ -233,7 +238,7 @@ class _Rasterize(torch.autograd.Function):
         tiles.leave_out_non_finite(projected, features)
         order = tiles.depth_order(projected)
         colors = packed_colors(gaussians, camera, features, order, request.plan)
-        lists = tiles.bin_splats(projected, order, colors, camera, places=True, keep=True)
+        lists = tiles.bin_splats(projected, order, colors, camera, places=True, keep=True, room=request.room)
         image, transmittance, depth_sum, surface, last, hit = composite_recorded(
             lists, camera, settings, features, request.plan.depth, request.schedule
         )

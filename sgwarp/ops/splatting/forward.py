@@ -17,6 +17,7 @@ from sgwarp.kernels.transmittance import Lanes
 from sgwarp.ops.launcher import fresh, get_threads, launch, launch_blocks, scratch, view, warp_device
 from sgwarp.ops.splatting import tiles
 from sgwarp.ops.splatting.plan import RenderPlan, Values, plan_render
+from sgwarp.ops.splatting.room import ListRoom
 from sgwarp.ops.splatting.settings import RasterSettings
 from sgwarp.scene import Camera, Gaussians
 from sgwarp.scene.checks import require_finite
@@ -61,6 +62,7 @@ def rasterize(
     settings: RasterSettings = RasterSettings(),  # noqa: B008 - frozen
     plan: RenderPlan | None = None,
     look: bool = True,
+    room: ListRoom | None = None,
 ) -> Rendering:
     """Render a view (paper eq. 1): project, order by (depth, index), list per tile, composite front to back.
 
@@ -73,6 +75,7 @@ def rasterize(
         settings: The approximations.
         plan: What to compute, and what not; derived from the scene and the request if None.
         look: Look which harmonics the scene uses, where the plan is derived; on CUDA that waits, once per scene.
+        room: For the tile lists: with it nobody waits for their length on CUDA.
 
     Raises:
         InputError: `features` or `background` do not fit.
@@ -97,7 +100,7 @@ def rasterize(
     tiles.leave_out_non_finite(projected, features)
     order = tiles.depth_order(projected)
     colors = packed_colors(gaussians, camera, features, order, plan)
-    lists = tiles.bin_splats(projected, order, colors, camera)
+    lists = tiles.bin_splats(projected, order, colors, camera, room=room)
     image, transmittance, depth_sum, surface = composite(lists, camera, settings, features, plan.depth)
     if background is not None:
         image = image + transmittance[..., None] * background.to(image)

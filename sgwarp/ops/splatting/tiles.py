@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from functools import lru_cache
+from weakref import WeakKeyDictionary
 
 import torch
 import warp as wp
@@ -16,13 +18,13 @@ from sgwarp.kernels.harmonics import forward as harmonics
 from sgwarp.kernels.projection import forward as projection
 from sgwarp.kernels.projection import lanes as projection_lanes
 from sgwarp.ops.launcher import launch, launch_plain, scratch, sort_pairs, view, warp_device
+from sgwarp.ops.splatting.room import MOST, ListRoom
 from sgwarp.ops.splatting.settings import RasterSettings
 from sgwarp.scene import Camera, Gaussians
 
 TILE = 16
 SLICES = 16  # of the depth order, counted and filled independently; not the number of threads
 MAX_INTERSECTIONS = 2**31 - 1
-MAX_SORTED = 2**30 - 1  # a sort takes twice the room, and Warp counts in int32
 
 
 @dataclass(frozen=True)
@@ -103,8 +105,18 @@ def as_splats(memory: Tensor) -> wp.array:
     return splats
 
 
+_pinholes: WeakKeyDictionary[Camera, Pinhole] = WeakKeyDictionary()
+
+
 def pinhole(camera: Camera) -> Pinhole:
-    """The camera as the kernels read it."""
+    """The camera as the kernels read it; made once for each camera, since every kernel of a step reads it."""
+    held = _pinholes.get(camera)
+    if held is None:
+        held = _pinholes[camera] = _make_pinhole(camera)
+    return held
+
+
+def _make_pinhole(camera: Camera) -> Pinhole:
     fx, fy, cx, cy = (camera.K[i, j].item() for i, j in ((0, 0), (1, 1), (0, 2), (1, 2)))
     center = camera.position
     rounded = center.to(torch.float32)
@@ -123,6 +135,7 @@ def pinhole(camera: Camera) -> Pinhole:
     return device
 
 
+@lru_cache(maxsize=64)
 def knobs(settings: RasterSettings) -> projection.Knobs:
     """The settings as the kernels read them."""
     device = projection.Knobs()
@@ -225,18 +238,24 @@ def bin_splats(
     places: bool = False,
     tiles: bool = False,
     keep: bool = False,
+    room: ListRoom | None = None,
 ) -> TileLists:
     """Write the tile lists of a view.
 
     `colors` [V, 3] travel with the splats; `places` and `tiles` of the entries are filled only if asked for. With
-    `keep` the lists have memory of their own: they outlive the view, as a backward pass needs it.
+    `keep` the lists have memory of their own: they outlive the view, as a backward pass needs it. On CUDA nobody waits
+    for the length of the lists if they are given a `room`.
     """
     device = order.device
     packed = view(colors, wp.vec3) if colors is not None else wp.empty(0, dtype=wp.vec3, device=warp_device(device))
     memory = splat_memory(len(order), device, None if keep else "ordered splats")
     order = order.clone() if keep else order
-    count = bin_by_sorting if device.type == "cuda" else bin_by_counting
-    return count(projected, order, packed, camera, memory, places=places, tiles=tiles, keep=keep)
+    if device.type == "cuda":
+        return bin_by_sorting(projected, order, packed, camera, memory, keep=keep, room=room)
+    lists = bin_by_counting(projected, order, packed, camera, memory, places=places, tiles=tiles, keep=keep)
+    if room is not None:
+        room.note(lists.entries[-1].to(torch.int64))
+    return lists
 
 
 def bin_by_counting(
@@ -284,22 +303,31 @@ def bin_by_sorting(
     camera: Camera,
     memory: Tensor,
     *,
-    places: bool,
-    tiles: bool,
     keep: bool,
+    room: ListRoom | None = None,
 ) -> TileLists:
-    """Emit in depth order, sort by tile, list (CUDA); the lists are those of `bin_by_counting`."""
+    """Emit in depth order, sort by tile, list (CUDA); the lists are those of `bin_by_counting`.
+
+    In a `room` larger than needed, unused places follow those of the last tile, whose end `offsets` says.
+    """
     device, count, grid = order.device, len(order), _tile_count(camera)
     size = [camera.width, camera.height]
     splat_counts = scratch("splat counts", count, torch.int32, device)
     splats = as_splats(memory)
     inputs = [view(order, wp.int32), projected.splats, colors, view(projected.status, wp.uint8), *size]
     launch_plain(binning.count_splat_tiles, count, inputs, [splats, view(splat_counts, wp.int32)], device=device)
-    entries, total = _first_places(splat_counts, MAX_SORTED)
+    if room is None:
+        entries, total = _first_places(splat_counts, MOST)
+    else:
+        entries, total = _places_in_room(splat_counts, room), room.size
     listed, places_of, tiles_of = (_intersections(name, total, device, keep) for name in ("listed", "places", "tiles"))
     keys = scratch("tile keys", 2 * total, torch.int32, device)
     values = scratch("tile values", 2 * total, torch.int32, device)
     ranks = scratch("tile ranks", total, torch.int32, device)
+    if room is not None:
+        tiles_of.fill_(grid)  # behind every tile
+        ranks.zero_()
+        values[:total] = torch.arange(total, dtype=torch.int32, device=device)
     outputs = [view(t, wp.int32) for t in (tiles_of, values, ranks)]
     launch_plain(binning.emit_tiles, count, [splats, *size, view(entries, wp.int32)], outputs, device=device)
     keys[:total] = tiles_of
@@ -309,6 +337,14 @@ def bin_by_sorting(
     outputs = [view(listed, wp.int32), view(places_of, wp.int32)]
     launch_plain(binning.list_sorted, total, [view(values, wp.int32), view(ranks, wp.int32)], outputs, device=device)
     return TileLists(order, memory, offsets, listed, entries, places_of, tiles_of)
+
+
+def _places_in_room(counts: Tensor, room: ListRoom) -> Tensor:
+    """First place of each splat's entries, int32 [n + 1]; those that the room does not hold have none."""
+    places = torch.zeros(len(counts) + 1, dtype=torch.int64, device=counts.device)
+    torch.cumsum(counts, 0, out=places[1:])
+    room.note(places[-1])
+    return places.clamp(max=room.size).to(torch.int32)
 
 
 def _tile_count(camera: Camera) -> int:

@@ -119,7 +119,7 @@ def test_sorted_lists_equal_counted_lists(scene):
     kept = [t.clone() for t in vars(counted).values()]
     memory = torch.zeros_like(counted.memory)
     packed = launcher.view(colors, wp.vec3)
-    by_sort = tiles.bin_by_sorting(projected, order, packed, camera, memory, places=True, tiles=True, keep=True)
+    by_sort = tiles.bin_by_sorting(projected, order, packed, camera, memory, keep=True)
     for name, want, got in zip(vars(counted), kept, vars(by_sort).values(), strict=True):
         assert torch.equal(want, got), name
 
