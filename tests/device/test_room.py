@@ -6,6 +6,8 @@ import torch
 import sgwarp as sg
 from sgwarp.ops.photometric import photometric_loss
 from sgwarp.ops.splatting import tiles
+from sgwarp.reconstruction.fitting.model import Gradients, Model
+from sgwarp.reconstruction.fitting.settings import FitSettings
 
 
 def leaves(gaussians):
@@ -54,13 +56,20 @@ def test_a_roomy_list_changes_nothing(there, needed):
     assert (room.needed, room.overflowed, room.grow(), room.size) == (needed, False, False, 2 * needed)
 
 
-def test_a_training_step_in_a_room_can_be_captured(there, needed, pretended_cuda):
-    """Nothing waits for the device, and nothing is sent there; without a room it would."""
+def test_a_training_step_in_a_room_can_be_captured(there, needed, make_scene, pretended_cuda):
+    """Rendering, loss, gradients and Adam: nothing waits for the device, and nothing is sent there."""
     room = sg.ListRoom(2 * needed)
     step(*there, room)  # loads kernels, and makes what is used again
     pretended_cuda.reset()
+    model, names = (
+        Model.starting(make_scene("sh3").gaussians.to("cuda")),
+        ("means", "quats", "scales", "opacities", "sh"),
+    )
+    before = model["means"].clone()
     with pretended_cuda.capturing():
-        step(*there, room)
+        gradients = step(*there, room)[2:]
+        model.update(Gradients(**dict(zip(names, gradients, strict=True))), 1e-3, FitSettings())
+    assert not torch.equal(model["means"], before)
     assert "radix_sort_pairs" in pretended_cuda.launches
     with pytest.raises(RuntimeError, match="waits for the device"), pretended_cuda.capturing():
         step(*there, None)
