@@ -225,6 +225,17 @@ def test_gsplat_rasterization(options, sh3, pretended_cuda):
         assert (mine.grad.cpu() - exact.grad).norm() < 5e-3 * exact.grad.norm() + 1e-6
 
 
+def test_the_facade_of_gsplat_projects_and_shades_by_kernels(sh3, pretended_cuda):
+    """In torch, forward and backward took 819 launches and operations that run something."""
+    pretended_cuda.reset()
+    gsplat_call(sh3.gaussians.to("cuda"), sh3.camera, "cuda")
+    assert {"tabulate_splats", "gather_moments", "evaluate_harmonics", "harmonics_backward"} <= set(
+        pretended_cuda.launches
+    )
+    assert pretended_cuda.work < 230
+    assert places(pretended_cuda.waits) == ["ops/planar/tables.py", "ops/planar/tables.py", COUNT]
+
+
 def gsplat_stages(gaussians, camera, device):
     pose, K = (t.float().to(device)[None] for t in (camera.world_to_camera, camera.K))
     radii, means2d, depths, conics, _ = gsplat.fully_fused_projection(

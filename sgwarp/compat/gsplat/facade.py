@@ -28,6 +28,7 @@ from sgwarp.compat.gsplat.projection import quat_scale_to_covar_preci as quat_sc
 from sgwarp.ops.planar.harmonics import harmonic_colors
 from sgwarp.ops.planar.projection import CAMERA_MODELS, ProjectedSplats, ProjectionSettings, select_rows
 from sgwarp.ops.planar.splats import SplatJob, composite_splats
+from sgwarp.ops.planar.tables import ShadeTable
 from sgwarp.runs.isolation import isolated
 from sgwarp.scene.checks import require_finite
 
@@ -204,6 +205,12 @@ def _values(
     values = []
     for i, (p, viewmat) in enumerate(zip(splats, images.images(viewmats), strict=True)):
         scene = i // images.cameras
+        by_kernel = sh_degree is not None and sh_degree <= 3 and not sparse and colors.dtype == torch.float32
+        if by_kernel and p.camera is not None:
+            of_scene = images.scenes(means)[scene].contiguous(), source[scene if shared else i].contiguous()
+            center = torch.linalg.inv_ex(viewmat.to(torch.float64))[0][:3, 3]  # unlike inv, it does not wait
+            values.append(ShadeTable.apply(*of_scene, center, p.index, p.camera, sh_degree))
+            continue
         rows = select_rows(source[scene if shared else i], p.index)
         if sh_degree is not None:
             center = torch.linalg.inv(viewmat.to(means.device, torch.float64))[:3, 3]

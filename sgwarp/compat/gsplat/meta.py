@@ -101,8 +101,7 @@ class SplatTable:
         """Scene, camera and Gaussian of each row, int64 [nnz]; None for a dense table."""
         if not self.packed:
             return {"batch_ids": None, "camera_ids": None, "gaussian_ids": None}
-        counts = torch.tensor([len(p.index) for p in self.splats], device=self.device)
-        image = torch.repeat_interleave(torch.arange(self.images.count, device=self.device), counts)
+        image = torch.cat([torch.full_like(p.index, i) for i, p in enumerate(self.splats)])
         cameras = self.images.cameras
         index = torch.cat([p.index for p in self.splats])
         return {"batch_ids": image // cameras, "camera_ids": image % cameras, "gaussian_ids": index}

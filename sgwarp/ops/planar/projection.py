@@ -14,10 +14,12 @@ import torch
 from torch import Tensor
 
 from sgwarp.errors import InputError
+from sgwarp.scene import Camera
 from sgwarp.scene.checks import require_finite
 
 CAMERA_MODELS = ("pinhole", "ortho", "fisheye")
 MIN_QUAT_NORM2 = 1e-6  # |q|^2 below this has no direction
+ALPHA_MAX = 0.999  # of the kernels that the smallest opacity must stay below
 FULL_REACH = 3.33  # standard deviations at which an opaque Gaussian falls below 1/255
 FACTOR_UNIT = math.sqrt(0.5 * math.log2(math.e))  # makes the exponent of a footprint a power of two
 
@@ -72,6 +74,7 @@ class ProjectedSplats:
         compensations: sqrt(area before / area after the dilation), [V]; None unless asked for.
         covariances: (xx, xy, yy), dilated [pixels^2], without gradient, [V, 3].
         radii: Half size of the bounding box of {alpha >= alpha_min}, rounded up [pixels], int32 [V, 2].
+        camera: Where kernels made the table, the camera as they read it.
     """
 
     index: Tensor
@@ -82,6 +85,7 @@ class ProjectedSplats:
     compensations: Tensor | None
     covariances: Tensor
     radii: Tensor
+    camera: Camera | None = None
 
 
 class _SelectRows(torch.autograd.Function):
@@ -140,6 +144,7 @@ def project_splats(
     covars: Tensor | None = None,
     opacities: Tensor | None = None,
     sparse: bool = False,
+    kernels: bool | None = None,
 ) -> ProjectedSplats:
     """Project Gaussians into one camera (EWA splatting, Zwicker et al. 2002) and leave out what it cannot see.
 
@@ -155,7 +160,12 @@ def project_splats(
         covars: Covariances [m^2], [N, 3, 3]; then `quats` and `scales` are not read.
         opacities: [N], for the extent of the footprint; None takes every Gaussian for opaque.
         sparse: Gradients of `means`, `quats`, `scales` and `covars` as sparse tensors (COO).
+        kernels: Let kernels do it where they can: pinhole cameras, quaternions and scales, float32. By default on CUDA.
     """
+    if means.is_cuda if kernels is None else kernels:
+        made = _by_kernels(means, viewmat, K, width, height, settings, quats, scales, covars, opacities, sparse)
+        if made is not None:
+            return made
     shapes = [covars] if covars is not None else [quats, scales]
     given = [t for t in (means, *shapes, opacities) if t is not None]
     index = _candidates(given, quats if covars is None else None, opacities, viewmat, settings)
@@ -180,6 +190,45 @@ def project_splats(
     else:
         plain, area = _projected_covariance(select_rows(covars, index, sparse), row_x, row_y)
     return _splats(index, means2d, points[2], plain, area, opacities, width, height, settings)
+
+
+def _by_kernels(
+    means: Tensor,
+    viewmat: Tensor,
+    K: Tensor,
+    width: int,
+    height: int,
+    settings: ProjectionSettings,
+    quats: Tensor | None,
+    scales: Tensor | None,
+    covars: Tensor | None,
+    opacities: Tensor | None,
+    sparse: bool,
+) -> ProjectedSplats | None:
+    """The table made by kernels, or None where they cannot make it."""
+    fields = [means, quats, scales] + ([] if opacities is None else [opacities])
+    single = all(t is not None and t.dtype == torch.float32 for t in fields)
+    # Compensations that are clamped have no gradient; the kernels' clamp is that of a splat too faint to be seen.
+    bounded = settings.compensated and (
+        opacities is None or settings.min_area_ratio > ProjectionSettings.min_area_ratio
+    )
+    plain = settings.camera_model == "pinhole" and 2.0**-16 <= settings.alpha_min < ALPHA_MAX and settings.near > 0
+    if covars is not None or not single or bounded or not plain or K.requires_grad:
+        return None
+    from sgwarp.ops.planar.tables import ProjectTable, TableRequest, read_camera
+
+    camera = read_camera(viewmat, K, width, height, settings.near, settings.far)
+    if camera is None:
+        return None
+    opacity = means.new_empty(0) if opacities is None else opacities.detach().contiguous()
+    request = TableRequest(camera, settings, opacity, sparse)
+    assert quats is not None
+    assert scales is not None
+    index, means2d, depths, conics, factors, compensations, covariances, radii = ProjectTable.apply(
+        means.contiguous(), quats.contiguous(), scales.contiguous(), viewmat, request
+    )
+    kept = compensations if settings.compensated else None
+    return ProjectedSplats(index, means2d, depths, conics, factors, kept, covariances, radii, camera)
 
 
 def _candidates(

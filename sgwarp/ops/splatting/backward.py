@@ -14,7 +14,7 @@ from sgwarp.kernels.compositing import block_backward as compositing_block_backw
 from sgwarp.kernels.compositing import lanes_backward as compositing_lanes_backward
 from sgwarp.kernels.compositing.lanes_backward import MOMENTS, row_columns
 from sgwarp.kernels.harmonics import backward as harmonics_backward
-from sgwarp.kernels.lifting.shared import sum_rows
+from sgwarp.kernels.lifting import shared as lifting
 from sgwarp.kernels.projection import backward as kernels
 from sgwarp.kernels.projection import lanes as projection_lanes
 from sgwarp.kernels.transmittance import LaneIds, Lanes
@@ -161,7 +161,7 @@ def composite_backward(
     elif together:
         totals = torch.zeros(count, *slices.shape[1:], device=device)
         inputs = [*lists.sums(), view(feature_rows, Lanes), 0, slices.shape[1]]
-        launch(sum_rows, len(lists.order), inputs, [view(totals, Lanes)], device=device)
+        launch(lifting.sum_rows, len(lists.order), inputs, [view(totals, Lanes)], device=device)
         v_features = totals.flatten(1)[:, :channels]
     else:
         v_features = _lift_gradient(lists, camera, v_image, settings, count, block, ordered)
@@ -266,8 +266,9 @@ def shade_backward(
     degree: int,
     *,
     pose: bool = False,
+    at: int = MOMENTS,
 ) -> tuple[Tensor, Tensor]:
-    """Differentiate `tiles.shade`; `v_means` is added to.
+    """Differentiate `tiles.shade`; `v_means` is added to. The gradient of the colours stands in the sums from `at` on.
 
     Returns:
         Gradient of the coefficients, [N, K, 3], and of each centre seen from the camera's, [N, 3] or, unless `pose`,
@@ -282,7 +283,7 @@ def shade_backward(
         degree,
         tiles.pinhole(camera),
         view(splats.sums, wp.float32),
-        MOMENTS,
+        at,
     ]
     outputs = [view(v_sh, wp.vec3), view(v_means, wp.vec3), view(v_offsets, wp.float32)]
     launch(harmonics_backward.harmonics_backward, n, inputs, outputs, device=device)
@@ -296,7 +297,7 @@ def pose_gradient(camera: Camera, poses: Tensor, v_offsets: Tensor | None) -> Te
         poses: Of the rotation about the camera's centre and of the translation, [N, 12].
         v_offsets: Of each centre seen from the camera's, [N, 3], where colours depend on the direction.
     """
-    total = _sum_rows(poses)
+    total = sum_rows(poses)
     v_translation = total[9:]
     pose, center = camera.world_to_camera.to(poses.device), camera.position.to(poses.device)
     gradient = torch.zeros(4, 4, dtype=torch.float64, device=poses.device)
@@ -304,13 +305,13 @@ def pose_gradient(camera: Camera, poses: Tensor, v_offsets: Tensor | None) -> Te
     gradient[:3, :3] = total[:9].view(3, 3) + torch.outer(v_translation, center)
     gradient[:3, 3] = v_translation
     if v_offsets is not None:
-        v_center = -_sum_rows(v_offsets)
+        v_center = -sum_rows(v_offsets)
         gradient[:3, :3] -= torch.outer(pose[:3, 3], v_center)
         gradient[:3, 3] -= pose[:3, :3] @ v_center
     return gradient
 
 
-def _sum_rows(rows: Tensor) -> Tensor:
+def sum_rows(rows: Tensor) -> Tensor:
     """Column sums in double precision, the same bits for any number of threads, float64 [Q]."""
     per_group = max(1, -(-len(rows) // GROUPS))
     partial = torch.zeros(GROUPS, rows.shape[1], dtype=torch.float64, device=rows.device)

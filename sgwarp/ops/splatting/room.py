@@ -1,4 +1,4 @@
-"""Room for tile lists, set aside before their length is known: nobody waits for it, and a CUDA graph can hold a step."""
+"""Room for tile lists before their length is known: nobody waits for it, and a CUDA graph can hold a step."""
 
 from __future__ import annotations
 
