@@ -174,11 +174,10 @@ def find_tool(name: str) -> str:
     return found
 
 
-def measure(subject: Subject, arch: int, folder: Path) -> dict[str, Any]:
-    """A row of the table."""
+def compiled(kernel: Any, arch: int, folder: Path) -> tuple[str, int, Loop]:
+    """What `ptxas` says of a kernel, its shared memory but for what is static [bytes], and its machine code."""
     import warp as wp
 
-    kernel = subject.make()
     wp.compile_aot_module(kernel.module, device=None, arch=arch, module_dir=folder, use_ptx=True)
     (ptx,) = folder.glob("*.ptx")
     ptx.write_bytes(ptx.read_bytes().rstrip(b"\0"))
@@ -186,16 +185,21 @@ def measure(subject: Subject, arch: int, folder: Path) -> dict[str, Any]:
     command = [find_tool("ptxas"), "-v", f"-arch=sm_{arch}", str(ptx), "-o", str(cubin)]
     said = subprocess.run(command, capture_output=True, text=True, check=True).stderr
     name = kernel.get_mangled_name() + "_cuda_kernel_forward"
-    about = said[said.index(f"'{name}'") :]
+    meta = json.loads(next(folder.glob("*.meta")).read_text())
+    code = subprocess.run([find_tool("nvdisasm"), "-c", str(cubin)], capture_output=True, text=True, check=True).stdout
+    start = code.index(f".text.{name}:")
+    listing = code[start : code.find("\n\t.section", start)]
+    return said[said.index(f"'{name}'") :], meta.get(f"{name}_smem_bytes", 0), parse(listing)
+
+
+def measure(subject: Subject, arch: int, folder: Path) -> dict[str, Any]:
+    """A row of the table."""
+    about, dynamic, whole = compiled(subject.make(), arch, folder)
     numbers = r"(\d+) bytes stack frame, (\d+) bytes spill stores.*?Used (\d+) registers.*?(?:(\d+) bytes smem|\n)"
     found = re.search(numbers, about, flags=re.DOTALL)
     assert found is not None
     stack, spills, registers, static = (int(number or 0) for number in found.groups())
-    meta = json.loads(next(folder.glob("*.meta")).read_text())
-    shared = meta.get(f"{name}_smem_bytes", 0) + static
-    code = subprocess.run([find_tool("nvdisasm"), "-c", str(cubin)], capture_output=True, text=True, check=True).stdout
-    start = code.index(f".text.{name}:")
-    whole = parse(code[start : code.find("\n\t.section", start)])
+    shared = dynamic + static
     by_registers = REGISTERS // (-(-registers // 8) * 8 * 256)
     blocks = min(by_registers, SHARED // (shared + SHARED_OF_BLOCK), THREADS // 256)
     row: dict[str, Any] = {"kernel": subject.name, "registers": registers, "stack": stack, "spills": spills}
@@ -206,6 +210,18 @@ def measure(subject: Subject, arch: int, folder: Path) -> dict[str, Any]:
     else:
         row |= {"per": subject.items, "instructions": sum(loop.own for loop in whole.walk())}
     return row
+
+
+def bucket_step(arch: int, folder: Path) -> int:
+    """Instructions of the per-bucket backward pass for one step of its lanes."""
+    from benchmarks.bucket_backward import replay_buckets
+
+    *_, whole = compiled(replay_buckets, arch, folder)
+    loops = whole.walk()
+    inner = max(loops, key=lambda loop: loop.holds("MUFU.EX2"))
+    # The compiler makes two loops of it: one that hands over, within it the one that replays.
+    around = [loop for loop in loops if inner in loop.inner and loop.holds("SHFL")]
+    return inner.own + sum(loop.own for loop in around)
 
 
 def estimates(rows: list[dict[str, Any]]) -> list[tuple[str, float]]:
@@ -261,9 +277,10 @@ hand in the listings of the earlier kernels; no script makes it again. Lifting 1
 in blocks of 16 x 32 sums took 984.
 
 The backward pass of Taming 3DGS and Faster-GS, a lane per Gaussian that walks the 256 pixels of a tile, needs 287
-steps for 32 fragments: to issue as little as the two-step sum it would have {limit:.0f} instructions a step, for
-replaying a fragment at a pixel ({step:.0f} here), nine sums, and passing the pixel's state to the next lane. No warp
-could skip, and 128 bytes per intersection would be stored and read. It promises no lower count.
+steps for 32 fragments: to issue as little as the two-step sum it would have {limit:.0f} instructions a step. The
+prototype in `benchmarks/bucket_backward.py` has {bucket} (replaying a fragment at a pixel, nine sums, handing the pixel
+over; some of them selects that a hand would save), which makes {buckets:,.0f} per intersection. No warp could skip, and
+128 bytes per intersection would be stored and read. So it is not adopted.
 
 ## Per thread
 
@@ -306,7 +323,8 @@ def write_page(result: dict[str, Any]) -> str:
         threads="\n".join(threads),
         dense=before.get("lift 16 channels", 0),
         limit=replay["warp_instructions"] * 32 / 287,
-        step=replay["steps"]["MUFU.EX2"],
+        bucket=result["bucket_step"],
+        buckets=result["bucket_step"] * 287 / 32,
         floors="\n".join(f"| {name} | {value:.1f} |" for name, value in estimates(result["kernels"])),
     )
 
@@ -326,7 +344,9 @@ def main() -> None:
             rows.append(measure(subject, arguments.arch, Path(folder)))
         print(rows[-1], flush=True)
     kept = json.loads(arguments.out.read_text()) if arguments.out.exists() else {}
-    result = {"arch": arguments.arch, "kernels": rows, "before": kept.get("before", {})}
+    with tempfile.TemporaryDirectory() as folder:
+        step = bucket_step(arguments.arch, Path(folder))
+    result = {"arch": arguments.arch, "kernels": rows, "bucket_step": step, "before": kept.get("before", {})}
     arguments.out.write_text(json.dumps(result, indent=1) + "\n")
     arguments.page.write_text(write_page(result))
 

@@ -2,8 +2,8 @@
 
     python -m benchmarks.gpu [--device cuda] [--out gpu_out] [--only right,timings,...] [--seconds 540] [--tiny]
 
-Each part writes gpu.json as it ends, so that a run that is cut short keeps what it found; docs/gpu.md is written from
-it with --page. `--device cpu --tiny` tries the parts themselves on a machine without a GPU; its times mean nothing.
+Each part writes gpu.json as it ends, so that a run that is cut short keeps what it found; --page docs/gpu.md puts it
+into that page. `--device cpu --tiny` tries the parts themselves on a machine without a GPU; its times mean nothing.
 """
 
 from __future__ import annotations
@@ -44,7 +44,7 @@ def main() -> None:
     parser.add_argument("--only", default=",".join(PARTS), help="parts, with commas between them")
     parser.add_argument("--seconds", type=float, default=540.0, help="no part begins later")
     parser.add_argument("--tiny", action="store_true", help="scenes of a thousand Gaussians")
-    parser.add_argument("--page", type=Path, help="write the page docs/gpu.md from the results into this file")
+    parser.add_argument("--page", type=Path, help="put the results into this page, docs/gpu.md")
     options = parser.parse_args()
     chosen = options.only.split(",")
     if unknown := set(chosen) - set(PARTS):
@@ -62,7 +62,7 @@ def main() -> None:
             results["parts"][name] = run_part(name, bench)
         (options.out / "gpu.json").write_text(json.dumps(results, indent=1) + "\n")
     if options.page is not None:
-        options.page.write_text(page.written(results), encoding="utf-8")
+        options.page.write_text(page.written(results, options.page.read_text(encoding="utf-8")), encoding="utf-8")
 
 
 def run_part(name: str, bench: Bench) -> dict[str, object]:

@@ -4,25 +4,28 @@ from __future__ import annotations
 
 from typing import Any
 
-HEAD = """# On a GPU
-
-`python -m benchmarks.gpu` checks every operation on a CUDA device against the CPU and the float64 oracle, and then
-times it: by events on the device, on the host, and kernel by kernel. It takes ten minutes. A machine without network is
-served by `tools/pack_for_gpu.sh`.
-
-"""
+BEGIN, END = "<!-- measured -->\n", "<!-- end of what was measured -->\n"
 NOTHING = "**Not measured yet.** No GPU has run this version; nothing here or elsewhere claims a GPU time.\n"
 
 
-def written(results: dict[str, Any] | None) -> str:
-    """The page; without results from a GPU it says that nothing was measured."""
+def written(results: dict[str, Any] | None, page: str) -> str:
+    """The page with these results between its two marks; without results from a GPU it says that nothing was measured.
+
+    Raises:
+        ValueError: The page has no such marks.
+    """
+    before, rest = page.split(BEGIN)
+    return before + BEGIN + _measured(results) + END + rest.split(END)[1]
+
+
+def _measured(results: dict[str, Any] | None) -> str:
     if results is None or results.get("tiny") or "name" not in results["machine"]:
-        return HEAD + NOTHING
+        return NOTHING
     facts = results["machine"]
     lines = [f"{facts['name']}, {facts['memory_gib']} GiB, torch {facts['torch']}.\n"]
     for name, part in results["parts"].items():
-        lines += [f"## {name}\n", *_rows(part.get("found", part)), ""]
-    return HEAD + "\n".join(lines)
+        lines += [f"### {name}\n", *_rows(part.get("found", part)), ""]
+    return "\n".join(lines) + "\n"
 
 
 def _rows(found: dict[str, Any]) -> list[str]:

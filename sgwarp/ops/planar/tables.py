@@ -49,10 +49,11 @@ class TableRequest:
 
 def read_camera(viewmat: Tensor, K: Tensor, width: int, height: int, near: float, far: float) -> Camera | None:
     """The camera on the host, for which it waits once; None if it is none that the kernels know."""
-    parts = [t.detach().to(torch.float64).flatten() for t in (viewmat, K)]
-    pose, intrinsics = torch.cat(parts).cpu().split([16, 9])
+    pose, intrinsics = (t.detach().to(torch.float64).flatten() for t in (viewmat, K))
+    if pose.device == intrinsics.device:
+        pose, intrinsics = torch.cat([pose, intrinsics]).cpu().split([16, 9])
     try:
-        return Camera(intrinsics.view(3, 3), pose.view(4, 4), width, height, near, far)
+        return Camera(intrinsics.cpu().view(3, 3), pose.cpu().view(4, 4), width, height, near, far)
     except InputError:
         return None
 
