@@ -20,6 +20,8 @@ from sgwarp.ops.splatting.forward import LANE, TILE_ROWS, lane_scratch
 from sgwarp.ops.splatting.settings import RasterSettings
 from sgwarp.scene import Camera, Gaussians
 
+MOST_WEIGHTS = 2**31 - 1
+
 
 @dataclass(frozen=True, eq=False)
 class LocalIds:
@@ -30,7 +32,7 @@ class LocalIds:
         counts: How many they are, int32 [tiles].
         places: Place of each pixel's id in that list, -1 for none, int32 [tiles, 16, 16].
         uniform: The place that a row of 16 pixels shares, else -2, int32 [tiles, 16].
-        row_starts: First of a tile's weights, one for each of its splats and ids, int32 [tiles + 1].
+        row_starts: `first_weights`, int64 [tiles + 1].
     """
 
     tile_ids: Tensor
@@ -41,11 +43,15 @@ class LocalIds:
 
     def block_arrays(self) -> list[wp.array]:
         """What the block schedule reads."""
-        return [view(t, wp.int32) for t in (self.places, self.uniform, self.tile_ids, self.counts, self.row_starts)]
+        return [view(t, wp.int32) for t in (self.places, self.uniform, self.tile_ids, self.counts, self._starts())]
 
     def lane_arrays(self) -> list[wp.array]:
         """What the lane schedule reads."""
-        return [view(self.places, LaneIds), view(self.uniform, wp.int32), view(self.row_starts, wp.int32)]
+        return [view(self.places, LaneIds), view(self.uniform, wp.int32), view(self._starts(), wp.int32)]
+
+    def _starts(self) -> Tensor:
+        """As kernels read them; `weight_count` sees to it that they fit, where they are read."""
+        return self.row_starts.to(torch.int32)
 
 
 def localize_ids(lists: tiles.TileLists, camera: Camera, ids: Tensor) -> LocalIds:
@@ -58,9 +64,29 @@ def localize_ids(lists: tiles.TileLists, camera: Camera, ids: Tensor) -> LocalId
     outputs = [view(tile_ids, wp.int32), view(counts, wp.int32), view(places, LaneIds), view(uniform, wp.int32)]
     inputs = [_every_tile(device), view(ids, wp.int32), camera.width, camera.height]
     launch(lifting.localize_ids, count, inputs, outputs, device=device)
-    row_starts = torch.zeros(count + 1, dtype=torch.int32, device=device)
-    row_starts[1:] = ((lists.offsets[1:] - lists.offsets[:-1]) * counts).cumsum(0)
-    return LocalIds(tile_ids, counts, places, uniform, row_starts)
+    return LocalIds(tile_ids, counts, places, uniform, first_weights(lists.offsets, counts))
+
+
+def first_weights(offsets: Tensor, counts: Tensor) -> Tensor:
+    """First of each tile's weights, one for each of its splats and ids, and their number, int64 [tiles + 1]."""
+    starts = torch.zeros(len(offsets), dtype=torch.int64, device=offsets.device)
+    torch.cumsum(offsets.diff().to(torch.int64) * counts, 0, out=starts[1:])
+    return starts
+
+
+def weight_count(starts: Tensor) -> int:
+    """Number of weights; on CUDA the host waits for it.
+
+    Raises:
+        InputError: Kernels count them in int32.
+    """
+    total = int(starts[-1])
+    if total > MOST_WEIGHTS:
+        raise InputError(
+            f"ids: {total} weights of splats and the ids of their tiles exceed {MOST_WEIGHTS}; lift at a lower "
+            "resolution, or fewer ids"
+        )
+    return total
 
 
 def _every_tile(device: torch.device) -> wp.array:
@@ -83,7 +109,7 @@ def weigh_ids(
     counts, weights.
     """
     device, (height, width) = lists.order.device, camera.size
-    weights = scratch("id entry weights", int(local.row_starts[-1]), torch.float32, device).zero_()
+    weights = scratch("id entry weights", weight_count(local.row_starts), torch.float32, device).zero_()
     starts = scratch("id entry starts", lists.intersections, torch.int32, device)
     outputs = [view(weights, wp.float32), view(starts, wp.int32)]
     if block:

@@ -8,12 +8,12 @@ import torch
 import warp as wp
 from torch import Tensor
 
-from sgwarp.errors import InputError
 from sgwarp.kernels.lifting import lanes, lanes_changes, shared
 from sgwarp.kernels.transmittance import LaneIds, Lanes
 from sgwarp.ops.launcher import get_threads, launch, scratch, view
 from sgwarp.ops.splatting import tiles
 from sgwarp.ops.splatting.forward import LANE, TILE_ROWS, in_slices, lane_scratch
+from sgwarp.ops.splatting.id_weights import first_weights, weight_count
 from sgwarp.ops.splatting.lifting import LiftSums
 from sgwarp.ops.splatting.settings import RasterSettings
 from sgwarp.scene import Camera, FeatureMap, Gaussians
@@ -170,10 +170,8 @@ def _walk(
 
 def _row_starts(offsets: Tensor, counts: Tensor) -> Tensor:
     """First weight of each tile, int32 [tiles + 1]."""
-    starts = torch.zeros(len(counts) + 1, dtype=torch.int64)
-    torch.cumsum((offsets[1:] - offsets[:-1]).to(torch.int64) * counts, 0, out=starts[1:])
-    if int(starts[-1]) > tiles.MAX_INTERSECTIONS:
-        raise InputError(f"{int(starts[-1])} weights of a view exceed 2^31 - 1; lift at a lower resolution")
+    starts = first_weights(offsets, counts)
+    weight_count(starts)
     return starts.to(torch.int32)
 
 

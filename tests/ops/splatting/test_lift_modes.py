@@ -3,8 +3,9 @@
 import pytest
 import torch
 
+from sgwarp.errors import InputError
 from sgwarp.ops.reference.rasterizer import ReferenceSettings, blend_blocks, project_scene
-from sgwarp.ops.splatting import tiles
+from sgwarp.ops.splatting import id_weights, tiles
 from sgwarp.ops.splatting.lifting import LiftSums, add_weighted, lift_view
 from sgwarp.ops.splatting.settings import RasterSettings
 from sgwarp.scene import FeatureMap
@@ -90,3 +91,15 @@ def test_strongest_contributor(make_scene, name, kind):
         )
     lift_view(gaussians, camera, found, sums, mode="strongest")
     assert_close(sums, one, features, valid * clear)
+
+
+def test_more_weights_than_int32_counts_are_refused(make_scene, monkeypatch):
+    """Not wrapped around; the limit is lowered here, since 2^31 weights are 8 GiB."""
+    _, gaussians, camera = make_scene("sh3")
+    ids = torch.zeros(1, *camera.size, dtype=torch.int32)
+    feature_map = FeatureMap("s", ids=ids, labels=("a",))
+    monkeypatch.setattr(id_weights, "MOST_WEIGHTS", 10)
+    with pytest.raises(InputError, match="weights of splats and the ids of their tiles exceed 10"):
+        lift_view(gaussians, camera, feature_map, LiftSums.zeros(len(gaussians), 1))
+    starts = id_weights.first_weights(torch.tensor([0, 2**23, 2**24], dtype=torch.int32), torch.tensor([256, 256]))
+    assert starts.tolist() == [0, 2**31, 2**32]
