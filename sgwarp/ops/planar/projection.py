@@ -208,7 +208,8 @@ def _by_kernels(
     """The table made by kernels, or None where they cannot make it."""
     fields = [means, quats, scales] + ([] if opacities is None else [opacities])
     single = all(t is not None and t.dtype == torch.float32 for t in fields)
-    # Compensations that are clamped have no gradient; the kernels' clamp is that of a splat too faint to be seen.
+    # A compensation that is clamped has no gradient, which the kernels do not know; with opacities and the usual clamp
+    # such a splat is too faint to be kept.
     bounded = settings.compensated and (
         opacities is None or settings.min_area_ratio > ProjectionSettings.min_area_ratio
     )
