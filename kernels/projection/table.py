@@ -168,6 +168,9 @@ def scatter_colors(
     """Gradients of the colours of a table, for `harmonics_backward`."""
     k = wp.tid()
     i = int(index[k])
+    seen = float(0.0)
     for c in range(3):
         sums_out[i, c] = v_colors[k, c]
-    sums_out[i, SEEN] = 1.0
+        if v_colors[k, c] != 0.0:
+            seen = 1.0
+    sums_out[i, SEEN] = seen  # not where a coefficient is not finite: that splat is left out, and zero times it is NaN

@@ -122,7 +122,8 @@ class ProjectTable(torch.autograd.Function):
 class ShadeTable(torch.autograd.Function):
     """(means, sh, center, index, camera, degree) -> colours of the rows [V, 3], from harmonics of degree 0 to 3.
 
-    The values are those of the camera; the gradient of its centre goes to `center`, float64 [3].
+    The values are those of the camera; the gradient of its centre goes to `center`, float64 [3]. A row is NaN, which
+    compositing leaves out, where a coefficient up to the degree is not finite.
     """
 
     @staticmethod
@@ -133,6 +134,9 @@ class ShadeTable(torch.autograd.Function):
         order = index.to(torch.int32)
         inputs = [view(order, wp.int32), view(means, wp.vec3), view(sh, wp.vec3), degree, tiles.pinhole(camera)]
         launch(harmonics.evaluate_harmonics, len(index), inputs, [view(colors, wp.vec3)], device=means.device)
+        status = torch.zeros(len(means), dtype=torch.uint8, device=means.device)
+        tiles.mark_non_finite_colors(sh[:, : (degree + 1) ** 2].contiguous(), status)
+        colors.masked_fill_(status.index_select(0, index)[:, None] != 0, torch.nan)
         ctx.save_for_backward(means, sh, index)
         ctx.camera, ctx.degree = camera, degree
         return colors

@@ -107,6 +107,19 @@ def test_colors_of_a_table(make_scene):
         assert (got - want).norm() < 1e-5 * want.norm()
 
 
+def test_colors_that_are_not_finite_are_nan_and_have_no_gradient(make_scene):
+    _, gaussians, camera = make_scene("sh3")
+    sh = gaussians.sh.clone()
+    sh[2, 3, 1], sh[4, 0, 0], sh[6, 12, 0] = math.nan, math.inf, math.nan  # the last above the degree that is used
+    means, sh = gaussians.means.clone().requires_grad_(), sh.requires_grad_()
+    colors = ShadeTable.apply(means, sh, camera.position, torch.arange(len(sh)), camera, 2)
+    assert torch.isnan(colors).any(dim=1).nonzero().flatten().tolist() == [2, 4]
+    colors.nan_to_num().sum().backward()
+    assert torch.isfinite(means.grad).all()
+    assert torch.isfinite(sh.grad).all()
+    assert (means.grad[[2, 4]] == 0).all()
+
+
 @pytest.mark.parametrize("case", ["fisheye", "double", "covariances", "far planes", "skewed", "clamped"])
 def test_what_kernels_cannot_do_stays_with_torch(case, make_scene):
     _, gaussians, camera = make_scene("odd_size")
