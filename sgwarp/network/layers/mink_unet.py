@@ -97,7 +97,8 @@ class MinkUNet(nn.Module):
     def hidden(self, x: SparseTensor) -> SparseTensor:
         """Input of the last, linear layer: 64 or 96 channels per voxel, whatever the size of the embedding."""
         if self.training:
-            torch._foreach_add_([m.num_batches_tracked for m in self.modules() if isinstance(m, nn.BatchNorm1d)], 1)
+            norms = [module for module in self.modules() if isinstance(module, nn.BatchNorm1d)]
+            torch._foreach_add_([n.num_batches_tracked for n in norms if n.num_batches_tracked is not None], 1)
         x = relu(self.bn0(self.conv0p1s1(x)))
         beside = []
         for conv, norm, block in self._down:

@@ -154,6 +154,7 @@ class BatchNorm(nn.Module):
 
     def forward(self, x: SparseTensor) -> SparseTensor:
         bn = self.bn
+        assert bn.momentum is not None
         learns = self.training and len(x.features) > 1
         y = nn.functional.batch_norm(
             x.features, bn.running_mean, bn.running_var, bn.weight, bn.bias, learns, bn.momentum, bn.eps
