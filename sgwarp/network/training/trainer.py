@@ -141,8 +141,9 @@ class _Run:
             torch.manual_seed(s.seed)
             net = MinkUNet(INPUT_CHANNELS[s.inputs], channels, s.arch).to(self.device)
         self.network = SemanticNetwork(net, s.inputs, s.voxel, space, labels)
-        rates = {"lr": s.learning_rate, "weight_decay": s.weight_decay}
-        self.optimizer = torch.optim.AdamW(net.parameters(), **rates, fused=self._fused)
+        self.optimizer = torch.optim.AdamW(
+            net.parameters(), lr=s.learning_rate, weight_decay=s.weight_decay, fused=self._fused
+        )
 
     @property
     def _fused(self) -> bool | None:

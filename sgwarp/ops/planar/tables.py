@@ -108,7 +108,7 @@ class ProjectTable(torch.autograd.Function):
         pose = ctx.needs_input_grad[3]
         result = backward.project_backward(gaussians, request.camera, request.raster_settings, splats, pose=pose)
         v_viewmat = backward.pose_gradient(request.camera, result.poses, None).to(viewmat) if pose else None
-        gradients = (result.means, result.quats, result.scales)
+        gradients: tuple[Tensor, ...] = (result.means, result.quats, result.scales)
         if request.sparse:
             gradients = tuple(
                 torch.sparse_coo_tensor(
