@@ -8,6 +8,7 @@ import pytest
 import torch
 
 from sgwarp.apps.instances import counts as counting
+from sgwarp.apps.instances import evidence as evidence_module
 from sgwarp.apps.instances.association import (
     MaskGraph,
     build_graph,
@@ -22,6 +23,7 @@ from sgwarp.apps.instances.finder import mean_features
 from sgwarp.apps.instances.settings import InstanceSettings
 from sgwarp.apps.instances.view_agreement import agreement
 from sgwarp.encoders.masks.sources import ViewMasks
+from sgwarp.errors import InputError
 from sgwarp.ops.reference import lifting as reference
 from sgwarp.ops.reference.rasterizer import rotation_matrices
 from sgwarp.ops.splatting.settings import RasterSettings
@@ -87,6 +89,14 @@ def test_overlaps_are_those_of_the_formula(stage, seen):
     faint = wanted <= 0.0101 * np.minimum(own[:, None], own)
     np.testing.assert_allclose(found[~faint], wanted[~faint], rtol=1e-3)
     assert bool((found[wanted < 0.0099 * np.minimum(own[:, None], own)] == 0).all())
+
+
+def test_the_first_gaussian_counts_like_any_other():
+    """Two masks that hold Gaussian 0 alone share all of its mass: w^3 / (w^2 + 1) for two views of weight w."""
+    views = [hand_made([0], [0], [2.0], [[1], [0]], ["a"]), hand_made([0], [0], [2.0], [[1], [0]], ["b"])]
+    graph = build_graph(views, "default", 1, EXACT)
+    assert (graph.first.tolist(), graph.second.tolist()) == ([0], [1])
+    np.testing.assert_allclose(graph.shared, [8 / 5])
 
 
 def test_a_sample_estimates_the_overlaps(stage, seen):
@@ -253,6 +263,19 @@ def test_view_evidence_is_small(stage):
     found = ViewMasks.without_empty(many, torch.full((300,), -1))
     evidence = view_evidence(stage.gaussians, view, found, RasterSettings())
     assert len(evidence.gaussians) < 12 * len(stage.gaussians) < 300 * len(stage.gaussians)
+
+
+def test_masks_overlap_in_so_many_ways_and_no_more(stage, monkeypatch):
+    """Two masks that overlap cut a view into three sets: the first alone, the second alone, both."""
+    view: View = stage.views[0]
+    masks = torch.zeros(2, *view.camera.size, dtype=torch.bool)
+    masks[0, :, :40], masks[1, :, 20:] = True, True
+    found = ViewMasks(masks, torch.full((2,), -1))
+    monkeypatch.setattr(evidence_module, "MAX_SETS", 3)
+    assert len(view_evidence(stage.gaussians, view, found, RasterSettings()).members) == 4  # one holds no mask
+    monkeypatch.setattr(evidence_module, "MAX_SETS", 2)
+    with pytest.raises(InputError, match="overlap in 3 ways, at most 2"):
+        view_evidence(stage.gaussians, view, found, RasterSettings())
 
 
 @pytest.mark.parametrize(("angle", "doubted"), [(0.0, True), (0.4, True), (0.5, False), (3.0, False)])
