@@ -44,6 +44,8 @@ def test_every_source_is_listed(capsys):
     for kind in KINDS:
         assert f"  {kind.name:12} {kind.about} (" in text
         assert f"--encoder '{kind.example}'" in text
+    for role in ("image level: sees one region", "pixel level: features for every pixel", "instance level: finds"):
+        assert text.count(role) == 1
     assert run("encoders", "--json") == 0
     facts = {row["name"]: row for row in json.loads(capsys.readouterr().out)}
     assert facts.keys() == {kind.name for kind in KINDS}

@@ -82,7 +82,7 @@ def test_masks_and_tracks(files, tracked):
 def test_the_run_says_what_it_left_out(tracked):
     run = json.loads((tracked / "run.json").read_text())
     assert run["command"].startswith("sgwarp track")
-    assert {"lift", "encode", "fuse", "ask", "write"} <= set(run["stages"])
+    assert {"read", "lift", "encode", "fuse", "ask", "write"} <= set(run["stages"])
     assert run["left_out"]["projections"] > 0
     assert 0 < run["error"]["share_of_tiles_left_out"] < 1
     assert str(tracked / "tracks.json") in run["outputs"]
@@ -91,7 +91,7 @@ def test_the_run_says_what_it_left_out(tracked):
 def test_pictures(files, tracked, tmp_path):
     import cv2
 
-    assert not (tracked / "video.mp4").exists()
+    assert not {"video.mp4", "contact_sheet.jpg", "trajectories.png"} & {path.name for path in tracked.iterdir()}
     assert main([*arguments(files, tmp_path, "--frames", "3"), "--pictures"]) == 0
     height, width = read_rgb(tmp_path / "overlays" / "00000.jpg").shape[:2]
     sheet = read_rgb(tmp_path / "contact_sheet.jpg")

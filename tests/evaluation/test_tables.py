@@ -105,3 +105,11 @@ def test_the_command_offers_every_profile():
     from sgwarp.commands.evaluate import Evaluate
 
     assert get_args(get_args(get_type_hints(Evaluate, include_extras=True)["profile"])[0]) == tuple(PLACES)
+
+
+def test_an_output_that_cannot_be_is_refused_before_the_data_is_read(tmp_path, capsys):
+    from sgwarp.cli import main
+
+    (tmp_path / "file").write_text("")
+    assert main(["evaluate", "room", "--data", str(tmp_path / "nowhere"), "--out", str(tmp_path / "file")]) == 2
+    assert "--out" in capsys.readouterr().err

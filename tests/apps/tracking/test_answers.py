@@ -130,7 +130,7 @@ def test_facts_leave_out_steps_that_are_not_finite():
             return Frame(index, replace(spread(4), means=(means, moved)[index]))
 
     facts = sequence_facts(Two())
-    assert (facts["moving_share"], facts["largest_step"]) == (0.75, 4.0)
+    assert (facts["moving_share"], facts["median_step"], facts["largest_step"]) == (0.75, 3.0, 4.0)
     assert facts["non_finite_rows"] == 1
 
 
