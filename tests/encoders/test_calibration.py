@@ -58,6 +58,12 @@ def test_spaces_find_their_row_of_the_catalogue():
     assert {kind.name for kind in KINDS if kind.calibration} == {"conse", "clip", "siglip", "siglip2", "lseg"}
 
 
+def test_scorings_are_those_of_the_guide():
+    """docs/lift-and-ask.md names them, and how each says "none of these"."""
+    assert (CONSE.scoring, CLIP.scoring, LSEG.scoring, PAPER.scoring) == ("evidence", "relevancy", "cosine", "cosine")
+    assert (CONSE.least_deviation, CONSE.certain) == (0.02, 0.5)
+
+
 def test_an_encoder_may_state_its_own():
     own = Calibration("relevancy", 0.2)
     assert calibration_of(Axes(own)) is own

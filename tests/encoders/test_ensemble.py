@@ -103,6 +103,18 @@ def test_levels_are_shared():
         join_maps("both", [several, two], (0.5, 0.5))
 
 
+def test_levels_beside_a_dense_map():
+    """Levels of a pixel count as one direction of length 1; a pixel is unknown where all members are."""
+    levels = FeatureMap("one", ids=torch.tensor([[[0, 0, -1, -1]], [[1, -1, -1, -1]]]), vectors=torch.eye(2))
+    known = torch.tensor([[True, False, True, False]])
+    dense = FeatureMap("two", dense=torch.tensor([0.0, 2.0]).expand(1, 4, 2), valid=known)
+    found = join_maps("both", [levels, dense], [0.5, 0.5])
+    half = 0.5**0.5
+    expected = [[0.5, 0.5, 0.0, half], [half, 0.0, 0.0, 0.0], [0.0, 0.0, 0.0, half], [0.0] * 4]
+    torch.testing.assert_close(found.dense[0], torch.tensor(expected))
+    assert found.valid.tolist() == [[True, True, True, False]]
+
+
 def test_keys_and_maps_that_are_missing(pair, view):
     ensemble = Ensemble(pair, (1.0, 1.0))
     assert ensemble.cache_key(view) == "one@0.5 ++ two@0.5(key of one; key of two)"
