@@ -130,6 +130,12 @@ def attention(x, qkv, bias, out, out_bias, heads, mask=None):
     return torch.cat(parts, dim=1) @ out.T + out_bias
 
 
+@pytest.mark.parametrize("patch", [8, 16])
+def test_a_patch_gives_eight_cells_a_side(patch):
+    network = LSegNetwork(LSegShape(64, 4, 1, patch, 2, (4, 4, 4, 4), 4, 3)).eval()
+    assert network(torch.rand(1, 3, 4 * patch, 2 * patch)).shape == (1, 3, 8 * 4, 8 * 2)
+
+
 def test_transformer_against_plain_formulas(checkpoint, weights):
     """Tokens after the layers that are read out, at a size for which the positions have to be resized."""
     network = LSeg(str(checkpoint), tokenizer="nowhere").network.double()

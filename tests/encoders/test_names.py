@@ -1,6 +1,8 @@
 """Names of encoders, what is made of them, and what is said when they do not fit."""
 
+import ast
 import importlib.util
+from pathlib import Path
 from types import SimpleNamespace
 
 import cv2
@@ -23,6 +25,29 @@ from sgwarp.encoders.masks.sam import Sam
 from sgwarp.encoders.names import parse
 from sgwarp.encoders.registry import make_encoder, make_text_encoder, text_encoder_for
 from sgwarp.errors import InputError
+
+
+def builders() -> set[str]:
+    return {path for kind in KINDS for path in (kind.make, kind.speak) if path}
+
+
+@pytest.mark.parametrize("path", sorted(builders()))
+def test_a_builder_passes_the_device_on(path):
+    """To every class of its file that takes one; without a GPU no result would tell."""
+    module, _, function = path.partition(":")
+    tree = ast.parse(Path(importlib.util.find_spec(module).origin).read_text(encoding="utf-8"))
+    functions = [node for node in ast.walk(tree) if isinstance(node, ast.FunctionDef)]
+    takers = {
+        owner.name
+        for owner in tree.body
+        if isinstance(owner, ast.ClassDef)
+        for node in owner.body
+        if isinstance(node, ast.FunctionDef) and node.name == "__init__" and "device" in {a.arg for a in node.args.args}
+    }
+    (made,) = [node for node in functions if node.name == function]
+    calls = [node for node in ast.walk(made) if isinstance(node, ast.Call) and ast.unparse(node.func) in takers]
+    assert all("request.device" in ast.unparse(call) for call in calls)
+    assert calls or not takers or function != "make_text"
 
 
 def test_parts():

@@ -7,12 +7,15 @@ import pytest
 import torch
 
 from sgwarp.errors import InputError
+from sgwarp.lifting import lifter, ridge, robust
 from sgwarp.lifting.holes import TRUST, fill_holes
 from sgwarp.lifting.lifter import lift
 from sgwarp.lifting.reliability import LEAST, from_residuals
+from sgwarp.lifting.residuals import residual
 from sgwarp.lifting.ridge import RIDGES, conjugate_gradients
 from sgwarp.lifting.settings import LiftSettings
 from sgwarp.ops.reference.rasterizer import ReferenceSettings, blend_blocks, project_scene
+from sgwarp.ops.splatting.lifting import lift_view
 from sgwarp.runs.log import RunLog
 from sgwarp.scene import Camera, FeatureMap, Gaussians, Semantics, View
 
@@ -172,6 +175,41 @@ def test_solve_chooses_its_ridge_by_views_that_it_did_not_fit(stage):
     assert log.error["ridge"] in RIDGES
     assert 0 <= log.error["residual"] < 0.2
     assert torch.equal(solved.weight, lift(stage.gaussians, stage.views, stage.one_hot).weight)
+
+
+def test_the_ridge_is_the_one_that_misses_held_out_views_least(scene):
+    """Every sixth of 16 views is held out, from the fourth on; the middle one counts as the last of them."""
+    gaussians, five, five_maps, _ = scene
+    views = [replace(five[k % 5], stem=f"{k:02d}") for k in range(16)]
+    maps = {view.stem: five_maps[f"{k % 5}"] for k, view in enumerate(views)}
+    held = [views[3], views[10], views[8]]
+    rest = [view for view in views if view not in held]
+    missed = {}
+    for ridge in RIDGES:
+        one = lift(gaussians, rest, maps, "solve", lift_settings=LiftSettings(ridge=ridge))
+        known = (gaussians.finite & one.seen).float()
+        missed[ridge] = np.mean([residual(gaussians, v.camera, maps[v.stem], one.features, known) for v in held])
+    log = RunLog()
+    lift(gaussians, views, maps, "solve", log=log)
+    assert log.error["ridge"] == min(missed, key=missed.get)
+    assert log.error["residual"] == pytest.approx(min(missed.values()), rel=1e-4)
+
+
+@pytest.mark.parametrize("mode", ["weighted", "robust", "solve"])
+def test_every_walk_adds_up_in_a_fixed_order_if_asked(scene, mode, monkeypatch):
+    """On the CPU the order is always fixed, so no result would tell."""
+    gaussians, views, maps, _ = scene
+    asked = []
+    for module in (lifter, ridge, robust):
+
+        def spy(*arguments, real=lift_view, **options):
+            asked.append(options["deterministic"])
+            return real(*arguments, **options)
+
+        monkeypatch.setattr(module, "lift_view", spy)
+    lift(gaussians, views, maps, mode, deterministic=True)
+    assert len(asked) >= len(views)
+    assert set(asked) == {True}
 
 
 def test_maps_are_made_once_where_a_mode_walks_over_the_views_again(stage):
