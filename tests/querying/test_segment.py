@@ -8,7 +8,7 @@ import torch
 from sgwarp.errors import InputError
 from sgwarp.lifting.lifter import lift
 from sgwarp.metrics.segmentation import ConfusionMatrix
-from sgwarp.querying.scores import query
+from sgwarp.querying.scores import class_votes, query
 from sgwarp.querying.segmentation import UNKNOWN, box_mean, label_image, localize, segment, splat_scores
 from sgwarp.scene import Camera, Gaussians, Semantics
 
@@ -168,6 +168,13 @@ def test_a_pixel_is_known_from_half_an_opacity_on(opacity, known):
     mean, seen = splat_scores(wall, camera, torch.tensor([[0.7]]), torch.tensor([True]))
     assert (seen == known).all()
     torch.testing.assert_close(mean, torch.full_like(mean, 0.7))
+
+
+def test_a_temperature_that_cannot_be_is_refused(toy_semantics, lifted_labels, toy_text):
+    """Also where labels need none."""
+    for semantics in (toy_semantics, lifted_labels):
+        with pytest.raises(InputError, match="temperature"):
+            class_votes(semantics, ["1"], toy_text, temperature=0.0)
 
 
 def test_refusals(stage, toy_semantics, toy_text, held_out):

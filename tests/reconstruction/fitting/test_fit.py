@@ -244,6 +244,20 @@ def test_settings_are_checked(change, message):
         FitSettings(**change)
 
 
+@pytest.mark.parametrize("name", ["opacities_rate", "scale_pull", "noise", "grow_gradient", "split_scale", "least_opacity"])
+def test_rates_and_thresholds_are_not_negative(name):
+    with pytest.raises(InputError, match=f"{name}: expected a number that is not negative, got -1"):
+        FitSettings(**{name: -1.0})
+    assert getattr(FitSettings(**{name: 0.0}), name) == 0.0
+
+
+def test_the_ends_of_a_range_belong_to_it():
+    for share in (0.0, 1.0):
+        assert FitSettings(similarity_share=share).similarity_share == share
+    for degree in (0, 3):
+        assert FitSettings(sh_degree=degree).sh_degree == degree
+
+
 def test_schedules():
     settings = FitSettings(steps=6000)
     assert settings.means_rate_at(0, 2.0) == pytest.approx(3.2e-4)

@@ -96,6 +96,17 @@ def test_the_rate_of_an_exposure_falls():
 # The Markov chain.
 
 
+@pytest.mark.parametrize("name", ["maps", "first", "second", "steps"])
+def test_exposures_of_other_photographs_are_refused(name):
+    """Of another number, or of another type, which the kernel would read as other bits."""
+    state = Exposure(3, CPU).state()
+    assert set(state) == {"maps", "first", "second", "steps"}
+    for other in (state[name][:2], state[name].to(torch.float64)):
+        with pytest.raises(ValueError, match="of other photographs"):
+            Exposure(3, CPU).restore(state | {name: other})
+    Exposure(3, CPU).restore(state)
+
+
 def test_faint_gaussians_move_at_random():
     settings = FitSettings(strategy="mcmc", steps=30_000, cap=20)
 
