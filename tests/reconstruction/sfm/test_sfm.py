@@ -15,6 +15,7 @@ from sgwarp.files.images import write_rgb
 from sgwarp.io.points import load_points
 from sgwarp.io.views import load_views
 from sgwarp.io.world import similarity_between
+from sgwarp.reconstruction.sfm import features
 from sgwarp.reconstruction.sfm.features import SfmSettings
 from sgwarp.reconstruction.sfm.poses import estimate_poses
 from sgwarp.reconstruction.sfm.triangulation import triangulate
@@ -74,6 +75,25 @@ def test_photographs_that_do_not_overlap_are_refused(tmp_path):
         write_rgb(tmp_path / "in" / f"{index}.png", np.random.default_rng(index).random((96, 128, 3)))
     with pytest.raises(InputError, match="no two photographs overlap enough to place them"):
         estimate_poses(tmp_path / "in", tmp_path / "out")
+
+
+@pytest.mark.parametrize(("one_camera", "cameras"), [(True, [0, 0, 0, 1]), (False, [0, 1, 2, 3])])
+def test_photographs_of_one_size_share_a_camera_however_few_are_read_at_once(tmp_path, monkeypatch, one_camera, cameras):
+    import pycolmap
+
+    monkeypatch.setattr(features, "PHOTOGRAPHS_AT_ONCE", 1)
+    for index, width in enumerate((64, 64, 64, 80)):
+        write_rgb(tmp_path / f"{index}.png", np.random.default_rng(index).random((48, width, 3)))
+    names = [f"{index}.png" for index in range(4)]
+    database = tmp_path / "d.db"
+    features.extract_features(
+        database, tmp_path, names, SfmSettings(one_camera=one_camera, threads=1), lambda *progress: None
+    )
+    data = pycolmap.Database.open(database)
+    camera_of = {image.name: image.camera_id for image in data.read_all_images()}
+    data.close()
+    found = [camera_of[name] for name in names]
+    assert [sorted(set(found)).index(camera) for camera in found] == cameras
 
 
 def test_points_are_triangulated_with_the_given_poses_far_from_the_origin(corner):
