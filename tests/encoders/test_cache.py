@@ -143,6 +143,12 @@ MAPS = {
 
 
 @pytest.mark.parametrize("name", MAPS)
+@pytest.mark.parametrize("needs_image", [True, False])
+def test_a_cache_needs_the_image_if_its_source_does(tmp_path, needs_image):
+    source = SimpleNamespace(space="toy", needs_image=needs_image)
+    assert CachedMaps(source, tmp_path).needs_image is needs_image
+
+
 def test_every_kind_of_map_survives(name):
     found = unpack(pack(MAPS[name]))
     assert (found.space, found.labels) == (MAPS[name].space, MAPS[name].labels)

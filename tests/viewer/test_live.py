@@ -11,6 +11,7 @@ from sgwarp.reconstruction.fitting.trainer import fit
 from sgwarp.runs.log import RunLog
 from sgwarp.viewer import live as module
 from sgwarp.viewer.live import Live
+from sgwarp.viewer.server import Address
 
 
 def test_a_lift_shows_the_mean_of_the_views_so_far(stage):
@@ -98,6 +99,14 @@ def test_states_are_shown_at_most_once_a_second_and_the_last_one_surely(clock):
     live.finish()
     assert seen[2:] == [("update", 5)]
     assert (live.viewer.waited, live.viewer.closed) == (True, True)
+
+
+def test_the_viewer_listens_where_it_is_told(clock, monkeypatch):
+    addresses = []
+    monkeypatch.setattr(module, "open_viewer", lambda bench, address: addresses.append(address) or Shown(bench))
+    live = Live(lambda state: state, lambda bench, state: None, Address(port=1234))
+    live.watch(lambda: 1)
+    assert addresses == [Address(port=1234)]
 
 
 def test_slow_copies_are_made_less_often(clock):

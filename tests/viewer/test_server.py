@@ -171,6 +171,9 @@ def test_cameras_are_drawn_into_the_depth_of_the_scene(make_viewer, stage):
     # The page looks along z from the origin: the wall is 4 m away, the door 3 m, and beside the stage there is nothing.
     assert set(np.round(middle).ravel()) <= {3.0, 4.0}
     assert depth.max() > 160
+    client.send("GuiUpdateMessage", uuid=box, updates={"value": False})
+    gone = {client.wait_for("RemoveSceneNodeMessage")["name"] for _ in stage.views}
+    assert gone == {f"/cameras/{view.stem}" for view in stage.views}
 
 
 HOSTILE = [

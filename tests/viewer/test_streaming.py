@@ -3,6 +3,7 @@
 import itertools
 import threading
 from contextlib import suppress
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -11,9 +12,11 @@ import torch
 from sgwarp.ops import launcher
 from sgwarp.ops.launcher import Interrupted, interruptible
 from sgwarp.rendering.renderer import render
+from sgwarp.viewer import screen as screen_module
 from sgwarp.viewer.modes import Shot
 from sgwarp.viewer.pace import GOAL, SIZES, SLOWEST, Pace
-from sgwarp.viewer.streaming import Stream, Streamer
+from sgwarp.viewer.screen import Canvas
+from sgwarp.viewer.streaming import SHORTEST, Stream, Streamer
 
 
 class Screen:
@@ -137,6 +140,25 @@ def test_tabs_have_cameras_of_their_own(streamer, stage):
         screen.wait(finished)
         truth = (render(stage.gaussians, view).clamp(0, 1) * 255 + 0.5).byte().numpy()
         assert np.array_equal(screen.shown[-1][0], truth)
+
+
+def test_a_picture_waits_until_it_is_due(stage, camera):
+    now = [0.0]
+    streamer, stream = Streamer(lambda: now[0]), stream_of(stage, Screen())
+    streamer.add(stream)
+    streamer.move(stream, camera)
+    stream.next_at = SHORTEST
+    chosen, wait = streamer._next()
+    assert chosen is None
+    assert wait == pytest.approx(SHORTEST)
+    now[0] = SHORTEST
+    assert streamer._next() == (stream, 0.0)
+
+
+@pytest.mark.parametrize("waits", [True, False])
+def test_a_canvas_is_busy_while_its_client_has_not_taken_the_picture(monkeypatch, waits):
+    monkeypatch.setattr(screen_module, "is_waiting", lambda client: client.waits)
+    assert Canvas(SimpleNamespace(waits=waits), print).busy is waits
 
 
 def test_a_tab_that_was_removed_gets_nothing(streamer, stage, camera):

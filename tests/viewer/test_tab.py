@@ -2,6 +2,7 @@
 
 import importlib.util
 import itertools
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -15,8 +16,12 @@ from sgwarp.errors import InputError
 from sgwarp.io.scenes import load_gaussians
 from sgwarp.querying.scoring import score_texts
 from sgwarp.rendering.renderer import render
+from sgwarp.scene import Semantics
 from sgwarp.viewer import downloads
-from sgwarp.viewer.modes import draw
+from sgwarp.viewer.modes import HIGHLIGHT, TINT, _outlined, draw
+from sgwarp.viewer.paints import feature_colors
+from sgwarp.viewer.questions import Questions
+from sgwarp.viewer.splats import colors_of
 from sgwarp.viewer.tab import Tab
 from sgwarp.viewer.workbench import Materials, Workbench
 from sgwarp.visualization.pictures import class_colours, to_picture
@@ -131,6 +136,27 @@ def test_features_of_one_panel_have_one_color(tab, stage):
     assert min(apart) > 60
 
 
+def test_colors_of_features_are_their_principal_components():
+    """Against NumPy: centered unit features along three axes, from their 2nd to their 98th hundredth."""
+    noise = torch.Generator().manual_seed(0)
+    features = torch.randn(400, 5, generator=noise) * torch.tensor([3.0, 2.0, 1.0, 0.3, 0.2]) + 2.0
+    seen = torch.rand(400, generator=noise) > 0.1
+    found = feature_colors(Semantics(features * seen[:, None], seen.float(), seen.float(), "toy", "0" * 16)).numpy()
+    unit = features[seen].double().numpy()
+    unit /= np.linalg.norm(unit, axis=1, keepdims=True)
+    centered = unit - unit.mean(axis=0)
+    axes = np.linalg.svd(centered, full_matrices=False)[2][:3].T
+    axes *= np.where(((centered @ axes) ** 3).sum(axis=0) < 0, -1.0, 1.0)
+    low, high = np.quantile(centered @ axes, (0.02, 0.98), axis=0)
+    np.testing.assert_allclose(found[seen], ((centered @ axes - low) / (high - low)).clip(0, 1), atol=1e-4)
+    assert not found[~seen].any()
+
+
+def test_features_that_are_all_alike_have_one_color():
+    features, one = torch.ones(6, 4), torch.ones(6)
+    assert not feature_colors(Semantics(features, one, one, "toy", "0" * 16)).any()
+
+
 def test_instances_have_the_colors_of_their_ids(tab, stage):
     tab.set_strength(1.0)
     tab.set_mode("instances")
@@ -187,6 +213,11 @@ def test_ranked_instances_begin_with_the_one_named(tab):
     assert (ranked[0].id, ranked[0].name) == (7, "lamp")
     assert ranked[0].score > ranked[1].score + 0.5
     assert ranked[-1].name in ("wall", "left door", "object 8")
+
+
+def test_a_question_without_a_query_is_refused(tab):
+    with pytest.raises(InputError, match="query: is empty"):
+        tab.bench.asker.ask(Questions(()))
 
 
 def test_an_empty_box_forgets(tab):
@@ -296,8 +327,6 @@ def test_without_an_image_tower_pictures_are_refused(tab):
 
 
 def test_ensemble_with_the_network(stage, toy_semantics, toy_text):
-    from dataclasses import replace
-
     predicted = replace(toy_semantics, features=toy_semantics.features.roll(1, dims=1))  # it calls lamps books
     tab = Tab(Workbench(Materials(stage.gaussians, toy_semantics, predicted, toy_text)))
     lifted, network = (tab.ask("lamp", ensemble=one).scores.values[:, 0] for one in ("2d", "3d"))
@@ -508,6 +537,31 @@ def test_the_selection_is_outlined(tab, stage):
 # Edits
 
 
+def test_the_tint_of_a_selection_is_rounded(stage):
+    selected = torch.ones(len(stage.gaussians), dtype=torch.bool)
+    camera, inside = stage.views[2].camera, interior(stage.labels(stage.views[2]), 1)
+    for level in (100, 101, 102, 103):
+        shown = _outlined(np.full((*camera.size, 3), level, np.uint8), stage.gaussians, camera, selected)
+        expected = np.round((1 - TINT) * level + TINT * np.array(HIGHLIGHT))
+        assert (np.abs(shown[inside] - expected) <= 1e-6).mean() > 0.99
+
+
+def test_splats_of_a_selection_are_tinted(tab, stage):
+    tab.click(place_of(tab.camera, LAMP))
+    shot = tab.shot()
+    plain, shown = colors_of(replace(shot, selected=None)), colors_of(shot)
+    lamp = stage.classes == 3
+    torch.testing.assert_close(shown[~lamp], plain[~lamp])
+    torch.testing.assert_close(shown[lamp], (1 - TINT) * plain[lamp] + TINT * torch.tensor(HIGHLIGHT) / 255)
+
+
+def test_an_instance_is_selected_by_its_number(tab, instances):
+    for row in instances.table:
+        found = tab.select_instance(row.id)
+        assert (found.instance, found.level) == (row.id, row.level)
+        assert torch.equal(found.selected, instances.members(row.id))
+
+
 def test_delete_undo_and_redo(tab, stage):
     before = pixels(tab)
     tab.click(place_of(tab.camera, LAMP))
@@ -625,8 +679,6 @@ def test_saved_scene_and_script_agree(tab, stage, tmp_path):
 
 
 def test_saving_keeps_columns_unless_plain(stage, tmp_path):
-    from dataclasses import replace
-
     label = stage.classes.numpy().astype(np.int32)
     bench = Workbench(Materials(replace(stage.gaussians, extras={"label": label})))
     bench.apply("rows:0-9", ops.Remove())
@@ -691,8 +743,6 @@ def test_a_path_becomes_a_video(tab, stage, tmp_path):
 
 
 def test_a_flight_passes_its_keys_and_turns_evenly(stage):
-    from dataclasses import replace
-
     keys = [view.camera for view in stage.views[:3]]
     flight = downloads.fly(keys, 10)
     assert len(flight) == 21
@@ -719,8 +769,6 @@ def _shifted(camera, x):
 
 
 def test_frames_of_a_moving_scene(stage, tmp_path):
-    from dataclasses import replace
-
     from sgwarp.io.sequence_files import write_params
     from sgwarp.io.sequences import load_sequence
 
