@@ -56,7 +56,7 @@ class Batch:
     """local: processes on this machine. ray: a Ray cluster, or Ray on this machine."""
 
     address: str | None = None
-    """Of a Ray cluster; if not given, Ray is started on this machine and reachable from it alone."""
+    """Address of a Ray cluster; if not given, Ray is started on this machine and reachable from it alone."""
 
     shard: str | None = None
     """i/n: only every n-th scene from the i-th on, counted from 0; for array jobs."""
@@ -71,16 +71,16 @@ class Batch:
     """Where to compute: cpu, cuda or cuda:N."""
 
     gpus: float | None = None
-    """Of Ray: GPUs reserved for each worker, such as 0.5; 1 on cuda if not given."""
+    """With Ray, GPUs reserved for each worker, such as 0.5; if not given, 1 on CUDA."""
 
     retry_failed: bool = False
     """Try again what failed before; otherwise it is tried again once its inputs or options have changed."""
 
     time_limit: float | None = None
-    """Of a scene [seconds]."""
+    """Longest time that a scene may take [seconds]."""
 
     memory_limit: float | None = None
-    """Of a scene, resident [gigabytes]."""
+    """Largest resident memory that a scene may take [gigabytes]."""
 
     command_line: tyro.conf.Suppress[str] = ""
 

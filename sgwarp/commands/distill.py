@@ -58,7 +58,7 @@ class Distill(Options):
     """Times that every scene is seen."""
 
     learning_rate: float = 1e-3
-    """Of the first epoch; it falls to 0 along a cosine."""
+    """Learning rate of the first epoch; it falls to 0 along a cosine."""
 
     scenes_per_step: int = 1
     """Scenes whose gradients are averaged before a step, over all processes."""
@@ -90,7 +90,7 @@ class Distill(Options):
     """Multiply in bfloat16."""
 
     seed: int = 0
-    """Of the first weights, the order of the scenes and their changes."""
+    """Seed of the first weights, the order of the scenes and their changes."""
 
     checkpoint: Path | None = None
     """Weights to start from: a network of ours, or a checkpoint of MinkowskiEngine, OpenScene or the paper."""

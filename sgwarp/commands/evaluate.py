@@ -105,14 +105,14 @@ class Evaluate(Options):
     """Gaussians that are made of depth images, where there is no trained scene."""
 
     forgetting: float = 0.9
-    """Of moving scenes: weight of the past after one more frame; 0 takes every frame alone, as the paper does."""
+    """In moving scenes, the weight of the past after one more frame; 0 takes every frame alone, as the paper does."""
 
     ablate: str | None = None
     """Evaluate again with one thing changed: inputs, gaussians, views, modes, separated by commas. "inputs" trains
     networks."""
 
     epochs: int = 30
-    """Of the networks of --ablate inputs."""
+    """Epochs of the networks of --ablate inputs."""
 
     train: Path | None = None
     """Root of a data set that those networks learn from; the evaluated scenes themselves if not given."""
@@ -121,7 +121,7 @@ class Evaluate(Options):
     """Views to draw per scene."""
 
     seed: int = 0
-    """Of noise and shares."""
+    """Seed of noise and shares."""
 
     cache: str = ""
     """As for `sgwarp lift`."""

@@ -47,21 +47,22 @@ class Fit(Options):
     """Scene to write, .ply (or .compressed.ply, quantised)."""
 
     steps: int = 10_000
-    """How many photographs to look at; all schedules follow, and the degree of the colours rises every 1,000 steps, or
-    sooner in a short run."""
+    """Training steps, one photograph each. All schedules scale with them; the degree of the colors rises every 1,000
+    steps, sooner in a short run."""
 
     hold_out: int = 8
     """Measure on every n-th view, from the first on, and fit to the others; 0 fits to all."""
 
     strategy: Literal["mcmc", "default"] = "mcmc"
-    """How Gaussians come and go. mcmc: the transparent move, up to the cap. default: clone, split, remove, reset."""
+    """Density control. mcmc: transparent Gaussians move to opaque ones, and their number grows to the cap. default: as
+    in 3DGS, clone, split, remove and reset opacities."""
 
     cap: int = 100_000
-    """Never more Gaussians than this: trades quality for time and size. Of more points so many are taken, to which
+    """Largest number of Gaussians: trades quality for time and size. Of more points to start from, so many are taken;
     --strategy default then adds none."""
 
     sh_degree: Literal[0, 1, 2, 3] = 3
-    """Highest degree of the view-dependent colours; 0 gives small files."""
+    """Highest degree of the view-dependent colors; 0 gives small files."""
 
     downscale: int = 1
     """Divide width and height of the photographs by this."""
@@ -70,7 +71,7 @@ class Fit(Options):
     """Photographs wider or higher than this are then scaled down to it [pixels]; 0 for none."""
 
     background: Literal["black", "white", "random"] = "black"
-    """Behind the scene."""
+    """Color behind the scene."""
 
     init: Literal["auto", "points", "depth", "triangulated", "random"] = "auto"
     """What to start from; auto: depth if --depth is given, else the data set's points if it has some, else points
@@ -104,7 +105,7 @@ class Fit(Options):
     """Go on from the checkpoint beside the output."""
 
     seed: int = 0
-    """Of everything random; on the CPU the same seed gives the same scene, bit by bit."""
+    """Seed of everything random; on the CPU the same seed gives the same scene, bit by bit."""
 
     images: str | None = None
     """Name of a COLMAP model's folder of photographs, if it is not `images` nor the only one that holds them."""

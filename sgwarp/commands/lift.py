@@ -62,7 +62,7 @@ class Lift(SceneOptions):
     """Steps of mode solve."""
 
     reliability: bool = False
-    """Count a view less, the less the others agree with it."""
+    """Reduce the weight of views that disagree with the others."""
 
     fill: int = 0
     """Give Gaussians that no view saw the mean of so many seen neighbors; 0 leaves them empty."""

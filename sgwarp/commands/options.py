@@ -99,14 +99,14 @@ class SemanticsOptions(SceneOptions):
     """What phrases are put into, such as "a photo of a {}", or plain, photo, room; the encoder's own if not given."""
 
     min_weight: float = 0.0
-    """Gaussians with a smaller weight have no say, as if no view had seen them: 1 is one pixel filled by it alone."""
+    """Ignore Gaussians with a smaller weight, as if no view had seen them; a pixel that one fills alone weighs 1."""
 
     predicted: Path | None = None
     """What `sgwarp predict` wrote for this scene; it is then asked together with the lifted semantics."""
 
     ensemble: Literal["2d", "3d", "max", "sum", "mean"] = "max"
-    """How the scores of the lifted (2d) and the predicted (3d) semantics become one; where only one of them knows a
-    Gaussian, it speaks for both."""
+    """How the scores of the lifted (2d) and the predicted (3d) semantics become one; where only one of them has
+    features of a Gaussian, its score is taken."""
 
     def text_encoder(self, semantics: Semantics) -> TextEncoder:
         """The encoder of phrases in the space of the semantics.

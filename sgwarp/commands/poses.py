@@ -42,10 +42,10 @@ class Poses(Options):
     """All photographs of one size were taken with one camera and zoom."""
 
     every: int | None = None
-    """Of a video, keep the sharpest of so many frames; about 150 in all if not given."""
+    """Keep the sharpest of every so many frames of a video; if not given, about 150 frames are kept."""
 
     seed: int = 0
-    """Of everything random."""
+    """Seed of everything random."""
 
     def run(self) -> None:
         check_folder("--out", self.out)

@@ -31,14 +31,14 @@ class Predict(SceneOptions):
     """Run the network even if the projection covers the scene."""
 
     inputs: Literal["full", "xyz-rgb", "raw56", "ones", "signed-rgb"] | None = None
-    """Of a checkpoint, which does not say: raw56 for the paper's; for OpenScene's ones, or signed-rgb if trained with
-    input_color; by default the only ones that have its number of channels."""
+    """Inputs that a checkpoint was trained with, which its file does not store: raw56 for the paper's; for OpenScene's
+    ones, or signed-rgb if trained with input_color. If not given, the only ones with its number of channels."""
 
     voxel: float | None = None
-    """Side of a voxel [m], of a checkpoint, which does not say; by default 0.02."""
+    """Side of a voxel [m] that a checkpoint was trained with, which its file does not store; 0.02 if not given."""
 
     space: str | None = None
-    """Embedding space of a checkpoint, which does not say; by default its file name."""
+    """Embedding space of a checkpoint, which its file does not store; its file name if not given."""
 
     def run(self) -> None:
         check_name("--out", self.out, ".safetensors")

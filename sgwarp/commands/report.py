@@ -38,7 +38,7 @@ class Report(SceneOptions):
     """Runs of which the median time is taken."""
 
     seed: int = 0
-    """Of the patches and of the random share of Gaussians."""
+    """Seed of the patches and of the random share of Gaussians."""
 
     extremes: bool = True
     """Off: leave the extreme scenes out; they do not depend on the scene."""

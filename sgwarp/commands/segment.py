@@ -44,7 +44,7 @@ class Segment(SemanticsOptions):
     classes, so name all; "evidence" and "relevancy" leave what fits none of them unknown."""
 
     temperature: float | None = None
-    """Of the softmax over the classes, per Gaussian; the encoder's own if not given."""
+    """Temperature of the softmax over the classes, per Gaussian; the encoder's own if not given."""
 
     unknown_below: float = 0.0
     """Pixels whose best class has a smaller confidence are unknown, 0 to 1."""

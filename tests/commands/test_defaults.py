@@ -21,7 +21,14 @@ DEFAULTS = {
     },
     "fit": {
         **{"steps": 10_000, "hold_out": 8, "strategy": "mcmc", "cap": 100_000, "sh_degree": 3, "downscale": 1},
-        **{"max_size": 1600, "background": "black", "init": "auto", "sparse": True, "checkpoint_every": 1000, "seed": 0},
+        **{
+            "max_size": 1600,
+            "background": "black",
+            "init": "auto",
+            "sparse": True,
+            "checkpoint_every": 1000,
+            "seed": 0,
+        },
     },
     "instances": {
         **{"group": "association", "levels": "default", "least_iou": 0.3, "least_gaussians": 10},

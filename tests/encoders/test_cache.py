@@ -4,6 +4,7 @@ import io
 import os
 import shutil
 import zipfile
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -142,13 +143,13 @@ MAPS = {
 }
 
 
-@pytest.mark.parametrize("name", MAPS)
 @pytest.mark.parametrize("needs_image", [True, False])
 def test_a_cache_needs_the_image_if_its_source_does(tmp_path, needs_image):
     source = SimpleNamespace(space="toy", needs_image=needs_image)
     assert CachedMaps(source, tmp_path).needs_image is needs_image
 
 
+@pytest.mark.parametrize("name", MAPS)
 def test_every_kind_of_map_survives(name):
     found = unpack(pack(MAPS[name]))
     assert (found.space, found.labels) == (MAPS[name].space, MAPS[name].labels)

@@ -244,7 +244,9 @@ def test_settings_are_checked(change, message):
         FitSettings(**change)
 
 
-@pytest.mark.parametrize("name", ["opacities_rate", "scale_pull", "noise", "grow_gradient", "split_scale", "least_opacity"])
+@pytest.mark.parametrize(
+    "name", ["opacities_rate", "scale_pull", "noise", "grow_gradient", "split_scale", "least_opacity"]
+)
 def test_rates_and_thresholds_are_not_negative(name):
     with pytest.raises(InputError, match=f"{name}: expected a number that is not negative, got -1"):
         FitSettings(**{name: -1.0})

@@ -78,7 +78,9 @@ def test_photographs_that_do_not_overlap_are_refused(tmp_path):
 
 
 @pytest.mark.parametrize(("one_camera", "cameras"), [(True, [0, 0, 0, 1]), (False, [0, 1, 2, 3])])
-def test_photographs_of_one_size_share_a_camera_however_few_are_read_at_once(tmp_path, monkeypatch, one_camera, cameras):
+def test_photographs_of_one_size_share_a_camera_however_few_are_read_at_once(
+    tmp_path, monkeypatch, one_camera, cameras
+):
     import pycolmap
 
     monkeypatch.setattr(features, "PHOTOGRAPHS_AT_ONCE", 1)
