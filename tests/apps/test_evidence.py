@@ -55,6 +55,7 @@ def seen(stage):
     return evidence, dense
 
 
+@pytest.mark.slow
 def test_evidence_is_the_transpose_of_the_renderer(stage, seen):
     for view, (weights, total) in zip(*seen, strict=True):
         owner, mask, weight = view.mask_pairs(view.masks_of("default"))

@@ -58,6 +58,7 @@ def limited(tasks: list[Task]) -> list[Task]:
     return [replace(task, limits=limits.get(task.name, task.limits)) for task in tasks]
 
 
+@pytest.mark.slow
 def test_ray_gives_the_same_bytes_through_faults(batch):
     batch.add("scene02", "fails")
     batch.add("scene05", "eats")

@@ -65,6 +65,7 @@ def test_instances_writes_what_it_found(stage, stage_files, found):
         assert ((ids == name) & (truth == number)).sum() > 0.85 * ((ids == name) | (truth == number)).sum()
 
 
+@pytest.mark.slow
 def test_the_scene_has_columns(stage_files, found):
     rows = PlyData.read(str(found.parent / "with.ply"))["vertex"].data
     instances = load_instances(found, stage_files.gaussians)

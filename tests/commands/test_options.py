@@ -210,6 +210,7 @@ def test_lift_makes_its_encoder(stopped, stage_files, tmp_path, monkeypatch):
         assert (call[0], call[3], call[4]) == ("conse:dense", expected, 2.5)
 
 
+@pytest.mark.slow
 def test_lift_notes_how_it_was_done(stage, stage_files, tmp_path):
     out = tmp_path / "s.safetensors"
     name = f"files:{stage_files.labels}"

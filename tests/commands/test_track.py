@@ -79,6 +79,7 @@ def test_masks_and_tracks(files, tracked):
     assert len(tracks["left_out"]) == FRAMES
 
 
+@pytest.mark.slow
 def test_the_run_says_what_it_left_out(tracked):
     run = json.loads((tracked / "run.json").read_text())
     assert run["command"].startswith("sgwarp track")
@@ -88,6 +89,7 @@ def test_the_run_says_what_it_left_out(tracked):
     assert str(tracked / "tracks.json") in run["outputs"]
 
 
+@pytest.mark.slow
 def test_pictures(files, tracked, tmp_path):
     import cv2
 
@@ -115,6 +117,7 @@ def test_stored_features_are_those_of_the_frame(files, tracked):
     assert run["left_out"]["stored_features_that_did_not_change"] > 0
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("after", [1, 4])
 def test_a_killed_run_goes_on_to_the_same_bytes(files, tracked, tmp_path, monkeypatch, after):
     out, write = tmp_path / "out", tracking_run._write
@@ -144,6 +147,7 @@ def test_a_killed_run_goes_on_to_the_same_bytes(files, tracked, tmp_path, monkey
     assert mine == whole
 
 
+@pytest.mark.slow
 def test_resume_needs_the_same_options(files, tracked, capsys):
     assert main(arguments(files, tracked, "--features", "--resume", "--forgetting", "0.5")) == 2
     assert "had forgetting 0.9, now 0.5" in capsys.readouterr().err
@@ -184,6 +188,7 @@ def test_every_frame_alone_differs_from_fused(files, tracked, tmp_path):
     assert (tmp_path / "00003" / "1.png").read_bytes() != (tracked / "00003" / "1.png").read_bytes()
 
 
+@pytest.mark.slow
 def test_a_class_may_appear_in_a_later_frame(files, tmp_path, caplog):
     """An id that no image of the first frames shows is a class that is not there yet; one in no frame is said."""
     ids = {frame: set() for frame in range(FRAMES)}
@@ -327,6 +332,7 @@ OPTIONS = {
 }
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", OPTIONS)
 def test_an_option_changes_what_it_names_alone(stopped, name):
     value, read = OPTIONS[name]

@@ -45,6 +45,7 @@ def test_equals_the_native_rasterizer(raw, antialiased):
         torch.testing.assert_close(alphas[c, ..., 0], native.alpha, rtol=0, atol=5e-6)
 
 
+@pytest.mark.slow
 def test_matches_the_oracle_on_every_scene(scene):
     _, g, camera = scene
     features = torch.rand(len(g), 5, generator=torch.Generator().manual_seed(1))

@@ -240,6 +240,7 @@ def test_stages_compose_like_gsplats(raw):
         torch.testing.assert_close(a[clear], b[clear], rtol=0, atol=IMAGE_TOLERANCE)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("absgrad", [False, True])
 @pytest.mark.parametrize("packed", [False, True])
 def test_densification_strategy_runs_on_our_meta(raw, packed, absgrad):

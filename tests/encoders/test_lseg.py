@@ -282,6 +282,7 @@ def test_a_checkpoint_of_something_else(weights, tmp_path, change, message):
         LSeg(str(path))
 
 
+@pytest.mark.slow
 def test_damaged_checkpoints(checkpoint, weights, tmp_path):
     path = tmp_path / "x.ckpt"
     path.write_bytes(checkpoint.read_bytes()[:1000])

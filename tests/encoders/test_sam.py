@@ -63,6 +63,7 @@ def test_boxes(sam_models, kind, image):
     assert clear.float().mean() > 0.9
 
 
+@pytest.mark.slow
 def test_everything_asks_at_a_grid_of_points(sam_models, kind, image, tools, monkeypatch):
     """Loose settings leave out nothing but empty masks: three for the middle of each of 3 x 3 cells."""
     monkeypatch.setattr("sgwarp.encoders.masks.sam.without_repetitions", lambda masks, overlap, by_rank: masks)

@@ -40,6 +40,7 @@ def rows(out):
     return {(row["axis"], row["value"]): row for row in json.loads((out / "ablation.json").read_text())}
 
 
+@pytest.mark.slow
 def test_rows_are_the_evaluations_with_one_option_changed(rooms, tmp_path):
     out = tmp_path / "out"
     assert evaluate(rooms, out, "--ablate", "views,gaussians,modes") == 0

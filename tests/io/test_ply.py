@@ -77,6 +77,7 @@ def test_header_lines_may_end_in_crlf(tmp_path, ply_bytes):
     assert_scene(read_ply(scene_file(ply_bytes, tmp_path / "a.ply", rows, newline="\r\n")), rows, 0)
 
 
+@pytest.mark.slow
 @settings(deadline=None, max_examples=40)
 @given(data=st.data(), degree=st.sampled_from([0, 1, 2, 3]), count=st.integers(1, 6))
 def test_any_order_type_and_extra_columns(tmp_path_factory, ply_bytes, data, degree, count):

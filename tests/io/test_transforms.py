@@ -327,6 +327,7 @@ KEYS = st.sampled_from(
 )
 
 
+@pytest.mark.slow
 @settings(deadline=None, max_examples=150)
 @given(meta=st.dictionaries(KEYS, VALUES, max_size=4), own=st.dictionaries(KEYS, VALUES, max_size=3), matrix=VALUES)
 def test_random_values(tmp_path_factory, allow_input_error, meta, own, matrix):

@@ -247,6 +247,7 @@ class Sighted:
         return self.stage.one_hot(view)
 
 
+@pytest.mark.slow
 def test_photograph_where_there_is_one_else_a_rendering(stage, stage_files):
     picture = stage_files.views / "images" / "0000.png"
     views = [View("0000", stage.views[0].camera, picture), stage.views[1]]

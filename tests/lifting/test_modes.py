@@ -103,6 +103,7 @@ def test_robust_is_weiszfelds_iteration(scene, passes):
     np.testing.assert_allclose(lifted.features[clear], x[clear], atol=2e-3)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("ridge", [0.3, 10.0])
 def test_solve_is_the_ridge_solution(scene, ridge):
     gaussians, views, maps, matrices = scene
@@ -168,6 +169,7 @@ def test_reliability_only_takes_away():
     assert from_residuals({}) == {}
 
 
+@pytest.mark.slow
 def test_solve_chooses_its_ridge_by_views_that_it_did_not_fit(stage):
     log = RunLog()
     options = LiftSettings(iterations=2)

@@ -24,6 +24,7 @@ def same(state, net) -> bool:
     return state.keys() == mine.keys() and all(torch.equal(state[name], mine[name]) for name in mine)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("prefix", ["", "module.", "net3d.", "module.net3d."])
 @pytest.mark.parametrize("wrapper", [None, "state_dict"])
 def test_weights_of_torch_save(net, prefix, wrapper, tmp_path):

@@ -102,6 +102,7 @@ def test_a_small_net_is_the_dense_one():
     assert float((y.features - expected).detach().abs().max()) < 1e-12
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("arch", ["14A", "34A"])
 def test_every_parameter_gets_a_gradient(arch):
     torch.manual_seed(0)
@@ -172,6 +173,7 @@ def test_batch_norm_of_one_row_leaves_the_statistics_alone():
     assert norm.bn.running_mean.tolist() == [0, 0, 0]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("dtype", [torch.bfloat16, torch.float16])
 def test_autocast_follows_float32(dtype):
     torch.manual_seed(0)

@@ -19,6 +19,7 @@ anything = st.recursive(
 )
 
 
+@pytest.mark.slow
 @settings(max_examples=150, deadline=None)
 @given(anything, anything, anything, anything)
 def test_a_camera_is_taken_or_refused(wxyz, position, fov, side):

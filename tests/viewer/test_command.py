@@ -133,6 +133,7 @@ def test_lift_shows_what_it_writes(opened, stage_files, tmp_path):
     assert json.loads((tmp_path / "run.json").read_text())["outputs"] == [str(out)]
 
 
+@pytest.mark.slow
 def test_fit_shows_what_it_writes(opened, stage_files, tmp_path):
     out = tmp_path / "F.ply"
     options = ["--steps", 12, "--cap", 300, "--sh-degree", 0, "--hold-out", 0, "--init", "random", "--view"]

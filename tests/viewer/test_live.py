@@ -14,6 +14,7 @@ from sgwarp.viewer.live import Live
 from sgwarp.viewer.server import Address
 
 
+@pytest.mark.slow
 def test_a_lift_shows_the_mean_of_the_views_so_far(stage):
     states, order = [], []
 

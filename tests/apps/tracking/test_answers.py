@@ -151,6 +151,7 @@ def test_a_legend_names_what_is_shown_in_colors_that_stay():
     assert len(pictures.frame_picture([photograph], [many], names, range(1, 61), "t")) < 20 * pictures.LINE + 10
 
 
+@pytest.mark.slow
 def test_trajectories_have_gaps_where_an_object_was_away(tmp_path):
     """A line from (0, 0) to (10, 0) would cross the middle of the plot, where there is nothing."""
 

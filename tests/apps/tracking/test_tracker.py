@@ -95,6 +95,7 @@ def test_a_frame_alone_is_what_lift_gives(scene, truth):
         assert torch.allclose(one.effective_views, wanted.effective_views, rtol=1e-4)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("make", [label_maps, text_maps])
 @pytest.mark.parametrize("forgetting", [0.0, 0.9])
 def test_incremental_is_the_same_as_in_full(scene, truth, make, forgetting):
@@ -119,6 +120,7 @@ def test_no_frame_knows_the_future(scene, truth):
         assert torch.equal(one.features, other.features)
 
 
+@pytest.mark.slow
 def test_fusion_beats_single_frames_under_noise(scene, truth):
     noisy = label_maps(truth, 0.2)
     alone = quality(scene, truth, run(scene, noisy, ALONE, 8))
@@ -137,6 +139,7 @@ def shown_lit(scene, truth, one):
     return good / total
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("make", [label_maps, text_maps])
 def test_a_new_state_does_not_smear(scene, truth, make):
     """Three frames after the lamp went on it is on, and nothing of its past is left in the features."""
@@ -154,6 +157,7 @@ def test_a_new_state_does_not_smear(scene, truth, make):
         assert float(torch.nn.functional.cosine_similarity(*pairs).median()) > 0.95
 
 
+@pytest.mark.slow
 def test_a_still_frame_changes_nothing(scene, truth):
     recorded, maps = Recorded(scene), label_maps(truth)
     recorded.frames[1] = replace(recorded.frames[0], index=1)
@@ -164,6 +168,7 @@ def test_a_still_frame_changes_nothing(scene, truth):
     assert frames[1].features is frames[0].features
 
 
+@pytest.mark.slow
 def test_a_frame_without_gaussians(scene, truth):
     recorded, maps = Recorded(scene), label_maps(truth)
     recorded.frames[2] = Frame(2, no_gaussians())
@@ -297,6 +302,7 @@ def test_maps_must_be_of_one_kind_and_finite(scene, truth):
         count_frames(Recorded(scene), lambda frame: [], 99)
 
 
+@pytest.mark.slow
 def test_masks_without_identity_become_objects():
     """Ids are shuffled in every image, yet each large object is found at once and keeps its id.
 

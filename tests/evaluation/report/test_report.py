@@ -78,6 +78,7 @@ def written(on_disk, tmp_path_factory):
     return out
 
 
+@pytest.mark.slow
 def test_patches_are_pieces_of_the_whole_image(cloud):
     gaussians, views = cloud
     everything = 5 * 4  # 72 x 56 in squares of 16, the last ones cut
@@ -128,6 +129,7 @@ def test_shares_of_the_gaussians(cloud):
     assert image["resolution", "1/8"].shape == (HEIGHT, WIDTH, 3)
 
 
+@pytest.mark.slow
 def test_knobs_and_errors_go_together(written):
     record = json.loads((written / "report.json").read_text())
     assert record["about"]["gaussians"] == 300
@@ -173,6 +175,7 @@ def test_files_are_whole(written):
     assert len(run["outputs"]) == 3
 
 
+@pytest.mark.slow
 def test_extremes_are_on_the_page(cloud, tmp_path):
     from sgwarp.evaluation.report.run import make_report
 

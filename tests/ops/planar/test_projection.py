@@ -65,6 +65,7 @@ def test_linearisation_is_the_models_jacobian(model):
         torch.testing.assert_close(torch.stack([A, B, B, C]), torch.linalg.inv(cov).flatten(), rtol=1e-8, atol=1e-10)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("given", ["quats", "covars"])
 @pytest.mark.parametrize("model", ["pinhole", "ortho", "fisheye"])
 def test_gradients(model, given):

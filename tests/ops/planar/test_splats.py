@@ -33,6 +33,7 @@ def composite_scene(gaussians, camera, features, wants_depth=False):
     return leaves, images, job, p
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("channels", [3, 20])
 def test_images_and_gradients_match_the_oracle(scene, channels):
     _, gaussians, camera = scene

@@ -139,6 +139,7 @@ def test_transposed_convolution_is_the_dense_one(stride):
     assert_same(ours, theirs, (features, weight))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("side", "stride", "transposed"), [(3, 1, False), (2, 2, False), (2, 2, True)])
 def test_gradients_are_those_of_finite_differences(side, stride, transposed):
     fine = keys_of(25, 2)

@@ -52,6 +52,7 @@ def assert_is_the_oracles(
     assert torch.equal(ids[clear].long(), expected.ids[clear])
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("schedule", ["lanes", "block"])
 @pytest.mark.parametrize("k", [1, 5, 16])
 def test_matches_the_oracle(scene, k, schedule):

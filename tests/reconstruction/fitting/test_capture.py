@@ -36,6 +36,7 @@ def plain(boards):
 SETTINGS = FitSettings(steps=25, cap=600, sh_degree=0, evaluate_every=25)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("scale", "offset"), [(1e-3, 0.0), (1e6, 0.0), (1.0, 5e6)])
 def test_unit_and_origin_make_no_difference(boards, plain, scale, offset):
     shift = torch.tensor([offset, -offset, offset], dtype=torch.float64)
@@ -104,6 +105,7 @@ def test_photographs_beyond_the_memory_are_read_from_a_file():
         assert np.array_equal(pixels.read().numpy(), image)
 
 
+@pytest.mark.slow
 def test_random_points_lie_on_surfaces_where_photographs_agree(boards):
     frame = Frame.around(boards.views)
     positions, _, _ = random_points(read_photographs([*map(frame.view, boards.views)]), FitSettings(cap=4000))

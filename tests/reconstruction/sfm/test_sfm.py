@@ -36,6 +36,7 @@ def found(corner, tmp_path_factory):
     return folder, out, estimate_poses(folder, out, SfmSettings(threads=1))
 
 
+@pytest.mark.slow
 def test_poses_are_those_of_the_cameras_up_to_a_similarity(corner, found):
     _, out, registration = found
     assert len(registration.registered) == 8
@@ -98,6 +99,7 @@ def test_photographs_of_one_size_share_a_camera_however_few_are_read_at_once(
     assert [sorted(set(found)).index(camera) for camera in found] == cameras
 
 
+@pytest.mark.slow
 def test_points_are_triangulated_with_the_given_poses_far_from_the_origin(corner):
     shift = torch.tensor([5e6, 0.0, 5e6], dtype=torch.float64)
     views = []
@@ -113,6 +115,7 @@ def test_points_are_triangulated_with_the_given_poses_far_from_the_origin(corner
     assert colors.std() > 0.05
 
 
+@pytest.mark.slow
 def test_wrong_poses_leave_no_points_and_are_named(corner, caplog):
     order = (3, 0, 6, 1, 7, 4, 2, 5)
     wrong = [replace(view, camera=corner[1][other].camera) for view, other in zip(corner[1], order, strict=True)]
@@ -141,6 +144,7 @@ def test_the_sharpest_of_every_few_frames_is_kept(corner, tmp_path):
     assert not (tmp_path / "none").exists()
 
 
+@pytest.mark.slow
 def test_photographs_become_a_scene_in_one_command(found, tmp_path, capsys):
     folder, made, _ = found
     shutil.copytree(made, tmp_path / "scene.ply.sfm", symlinks=True)
