@@ -187,10 +187,10 @@ def test_the_ridge_is_the_one_that_misses_held_out_views_least(scene):
     held = [views[3], views[10], views[8]]
     rest = [view for view in views if view not in held]
     missed = {}
-    for ridge in RIDGES:
-        one = lift(gaussians, rest, maps, "solve", lift_settings=LiftSettings(ridge=ridge))
+    for strength in RIDGES:
+        one = lift(gaussians, rest, maps, "solve", lift_settings=LiftSettings(ridge=strength))
         known = (gaussians.finite & one.seen).float()
-        missed[ridge] = np.mean([residual(gaussians, v.camera, maps[v.stem], one.features, known) for v in held])
+        missed[strength] = np.mean([residual(gaussians, v.camera, maps[v.stem], one.features, known) for v in held])
     log = RunLog()
     lift(gaussians, views, maps, "solve", log=log)
     assert log.error["ridge"] == min(missed, key=missed.get)
