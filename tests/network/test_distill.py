@@ -183,6 +183,25 @@ def test_targets_are_mean_directions_of_the_seen_gaussians(stage):
     assert torch.equal(example.weights, torch.ones(len(example.rows)))
 
 
+def test_a_scene_of_which_three_gaussians_were_seen(stage):
+    """There are more voxels than Gaussians that say what they should be."""
+    g = stage.gaussians
+    seen = torch.zeros(len(g))
+    seen[-3:] = 1.0
+    features = torch.eye(3)[torch.arange(len(g)) % 3] * seen[:, None]
+    example = make_example(g, Semantics(features, seen, seen, "toy", g.fingerprint), "full", 0.05)
+    rows = voxelize(g, "full", 0.05).rows
+    assert set(example.rows.tolist()) == set(rows[-3:].tolist())
+    assert len(example.voxels.features) > 3
+
+
+def test_augmentation_needs_no_generator(stage):
+    g, one = stage.gaussians, torch.ones(len(stage.gaussians))
+    semantics = Semantics(torch.ones(len(g), 2), one, one, "toy", g.fingerprint)
+    plain, changed = (make_example(g, semantics, "full", 0.2, augment=a) for a in (None, Augmentation()))
+    assert not torch.equal(plain.of_gaussians, changed.of_gaussians)
+
+
 def test_reliability_grows_with_weight_and_views(stage):
     weight = torch.tensor([0.0, 1.0, 1.0, 4.0, 4.0])
     views = torch.tensor([0.0, 1.0, 4.0, 1.0, 9.0])
