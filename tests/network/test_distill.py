@@ -22,6 +22,7 @@ from sgwarp.network.prediction import predict
 from sgwarp.network.semantic_network import load_network
 from sgwarp.network.training import trainer
 from sgwarp.network.training.data import TrainingScene, make_example, reliability, scenes_in
+from sgwarp.network.training.processes import Processes
 from sgwarp.network.training.settings import DistillSettings
 from sgwarp.network.training.trainer import distill, state_path
 from sgwarp.runs.log import RunLog
@@ -106,6 +107,16 @@ def test_a_run_that_was_interrupted_goes_on_as_if_it_had_not_been(scenes, tmp_pa
     assert all(torch.equal(mine[name], theirs[name]) for name in theirs)
     with pytest.raises(InputError, match=r"another learning_rate \(0\.001, now 0\.01\)"):
         distill(scenes, replace(settings, learning_rate=0.01), state=state)
+
+
+def test_one_process_alone_writes_the_state(scenes, tmp_path):
+    class Follower(Processes):
+        leads = False
+
+    for processes, written in ((Follower(), False), (Processes(), True)):
+        path = state_path(tmp_path / "n.safetensors")
+        distill(scenes[:1], replace(SETTINGS, epochs=1), state=path, processes=processes)
+        assert path.exists() == written
 
 
 def test_a_damaged_state_is_refused(scenes, tmp_path):
@@ -402,7 +413,5 @@ def test_two_processes_train_as_one_does(folder):
 
 
 def test_processes_that_cannot_share_a_step_are_refused(scenes):
-    from sgwarp.network.training.processes import Processes
-
     with pytest.raises(InputError, match="take a multiple of 2"):
         distill(scenes, SETTINGS, processes=Processes(0, 2))

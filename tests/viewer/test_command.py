@@ -7,7 +7,7 @@ import torch
 
 from sgwarp.cli import main
 from sgwarp.io.instances import save_instances
-from sgwarp.io.store import save_semantics
+from sgwarp.io.store import load_semantics, save_semantics
 from sgwarp.viewer import live as live_module
 from sgwarp.viewer import server
 
@@ -67,6 +67,18 @@ def test_view_opens_what_it_is_given(opened, stage_files, files):
     assert len(given.instances.table) == 8
     assert [view.stem for view in given.views] == [f"{k:04d}" for k in range(6)]
     assert opened.addresses == [server.Address("127.0.0.1", 9000, None)]
+
+
+def test_view_asks_what_the_network_predicted(opened, stage_files, files, tmp_path):
+    from dataclasses import replace
+
+    lifted = load_semantics(files[0])
+    predicted = tmp_path / "P.safetensors"
+    save_semantics(replace(lifted, features=lifted.features.flip(1)), predicted, {"encoder": "files:x"})
+    assert run("view", stage_files.scene, "--semantics", files[0], "--predicted", predicted) == 0
+    given = opened.benches[0].materials
+    assert torch.equal(given.semantics.features, lifted.features)
+    assert torch.equal(given.predicted.features, lifted.features.flip(1))
 
 
 def test_view_of_a_scene_alone_and_for_others(opened, stage_files, files):
