@@ -18,6 +18,7 @@ from sgwarp.querying.scoring import score_texts
 from sgwarp.rendering.renderer import render
 from sgwarp.scene import Semantics
 from sgwarp.viewer import downloads
+from sgwarp.viewer import tab as tab_module
 from sgwarp.viewer.modes import HIGHLIGHT, TINT, _outlined, draw
 from sgwarp.viewer.paints import feature_colors
 from sgwarp.viewer.questions import Questions
@@ -723,6 +724,13 @@ def test_saved_picture_is_the_picture(tab):
 
     data = np.frombuffer(downloads.picture_file(tab.shot(), tab.camera), np.uint8)
     assert np.array_equal(cv2.imdecode(data, cv2.IMREAD_COLOR)[..., ::-1], draw(tab.shot(), tab.camera).pixels)
+
+
+def test_a_path_has_so_many_places_and_no_more(tab, monkeypatch):
+    monkeypatch.setattr(tab_module, "MOST_KEYS", 2)
+    assert (tab.add_key(), tab.add_key()) == (1, 2)
+    with pytest.raises(InputError, match="camera path: at most 2 places"):
+        tab.add_key()
 
 
 def test_a_path_becomes_a_video(tab, stage, tmp_path):
