@@ -69,24 +69,31 @@ def test_the_api_pages_list_every_name():
     }
 
 
-def can_fail(test: ast.FunctionDef) -> bool:
-    """Whether a test asserts, calls what does, or lets no exception pass but one (files with random bytes)."""
-    if any(argument.arg.startswith(("assert", "survives")) for argument in test.args.args):
-        return True
-    for node in ast.walk(test):
+def asserts(function: ast.AST) -> bool:
+    """Whether a function asserts, calls what does, or lets no exception pass but one (files with random bytes)."""
+    for node in ast.walk(function):
         if isinstance(node, ast.Assert):
             return not (isinstance(node.test, ast.Constant) and bool(node.test.value))
         called = ast.unparse(node.func) if isinstance(node, ast.Call) else ""
         if isinstance(node, ast.Try) or re.search(r"assert|raises|check|refuse|warns|suppress", called):
             return True
-    return any("given" in ast.unparse(decorator) for decorator in test.decorator_list)
+    return False
+
+
+def can_fail(test: ast.FunctionDef, helpers: set[str]) -> bool:
+    """Whether a test, a fixture that it takes or a helper of its file that it names asserts, or hypothesis feeds it."""
+    takes = any(argument.arg.startswith(("assert", "survives")) for argument in test.args.args)
+    given = any("given" in ast.unparse(decorator) for decorator in test.decorator_list)
+    named = {node.id for node in ast.walk(test) if isinstance(node, ast.Name)}
+    return takes or given or asserts(test) or bool(named & helpers)
+
+
+def idle_tests(path: Path) -> list[str]:
+    functions = [node for node in ast.walk(ast.parse(text_of(path))) if isinstance(node, ast.FunctionDef)]
+    tests = [node for node in functions if node.name.startswith("test_")]
+    helpers = {node.name for node in functions if node not in tests and asserts(node)}
+    return [f"{path.relative_to(ROOT)}: {test.name}" for test in tests if not can_fail(test, helpers)]
 
 
 def test_every_test_can_fail():
-    idle = [
-        f"{path.relative_to(ROOT)}: {node.name}"
-        for path in sorted((ROOT / "tests").rglob("test_*.py"))
-        for node in ast.walk(ast.parse(text_of(path)))
-        if isinstance(node, ast.FunctionDef) and node.name.startswith("test_") and not can_fail(node)
-    ]
-    assert not idle
+    assert not [idle for path in sorted((ROOT / "tests").rglob("test_*.py")) for idle in idle_tests(path)]

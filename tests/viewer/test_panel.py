@@ -2,6 +2,7 @@
 
 from contextlib import nullcontext
 from dataclasses import replace
+from types import SimpleNamespace
 
 import pytest
 
@@ -27,6 +28,9 @@ class Control:
 
     def on_update(self, work):
         self.change = work
+
+    def on_trigger(self, work):
+        self.press = work
 
 
 class Gui:
@@ -110,5 +114,5 @@ def test_a_moving_scene_has_a_slider_for_the_time(stage, open_panel, tmp_path, f
     assert ("Time" in controls) == (frames == 2)
     if frames == 2:
         controls["Time"].value = 1
-        controls["Time"].change(None)
+        controls["Time"].change(SimpleNamespace(client=object(), client_id=0, target=controls["Time"]))
         assert tab.look.moment == 1
