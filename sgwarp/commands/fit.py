@@ -93,7 +93,12 @@ class Fit(Options):
 
     refine_poses: bool = False
     """Also fit a small motion of every camera. The poses go to OUT.refined: give that folder as --views to other
-    commands. Held-out views keep the poses that they came with."""
+    commands."""
+
+    held_out_poses: Literal["auto", "given", "refined"] = "auto"
+    """Poses that held-out views are measured from. refined: also measure after the six numbers of each such pose were
+    fitted to the finished scene, which stays as it is. auto: refined with --refine-poses, and where `sgwarp fit` or
+    `sgwarp poses` has found the poses; given otherwise."""
 
     sparse: bool = True
     """Update only what a step's view has seen."""
@@ -146,6 +151,7 @@ class Fit(Options):
                 background=self.background,
                 exposure=self.exposure,
                 refine_poses=self.refine_poses,
+                refine_held_out=self._refines_held_out(source),
                 sparse=self.sparse,
                 seed=self.seed,
                 evaluate_every=min(EVALUATE_EVERY, max(1, self.steps // 10)),
@@ -181,6 +187,13 @@ class Fit(Options):
         if not fitted.complete:
             raise KeyboardInterrupt
         return live
+
+    def _refines_held_out(self, source: Path) -> bool:
+        """Whether the poses of held-out views are estimates, which carry an error of their own."""
+        from sgwarp.reconstruction.sfm.poses import NOTES
+
+        estimated = self.refine_poses or (source / NOTES).is_file()
+        return bool(self.hold_out) and (estimated if self.held_out_poses == "auto" else self.held_out_poses == "refined")
 
     @staticmethod
     def _live(views: list[View]) -> Live:
@@ -293,7 +306,11 @@ class Fit(Options):
             if held_out:
                 sheet = self.out.with_name(f"{self.out.stem}.held_out.jpg")
                 photographs = read_photographs(
-                    held_out, downscale=self.downscale, largest=self.max_size, masks=masks, device=self.device
+                    fitted.held_out_views or held_out,
+                    downscale=self.downscale,
+                    largest=self.max_size,
+                    masks=masks,
+                    device=self.device,
                 )
                 write_contact_sheet(fitted.gaussians, photographs, sheet, white=self.background == "white")
                 log.outputs.append(str(sheet))
@@ -303,7 +320,15 @@ class Fit(Options):
                 log.outputs.append(str(plot))
         log.error["held_out_psnr"] = last.psnr
         log.error["fitted_psnr"] = fitted.fitted_psnr
-        gap = fitted.fitted_psnr - last.psnr
+        measured = last.psnr
+        if fitted.held_out_refined:
+            measured = sum(fitted.held_out_refined.values()) / len(fitted.held_out_refined)
+            log.error["held_out_psnr_refined_poses"] = measured
+            logger.info(
+                "held out: %.2f dB from the poses given, %.2f dB from poses refined to the finished scene",
+                *(last.psnr, measured),
+            )
+        gap = fitted.fitted_psnr - measured
         if not math.isnan(gap):
             log.error["overfitting_gap"] = gap
         if gap > LARGEST_GAP:
@@ -311,7 +336,7 @@ class Fit(Options):
                 "overfitted: %.1f dB on the photographs that were fitted, %.1f dB on those held out; away from the "
                 "photographs the scene will look worse still. Take more photographs, from more places; start from "
                 "points; or use a smaller --cap",
-                *(fitted.fitted_psnr, last.psnr),
+                *(fitted.fitted_psnr, measured),
             )
         log.error["loss"] = last.loss
         log.curve = [asdict(point) for point in fitted.curve]

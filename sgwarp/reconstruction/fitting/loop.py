@@ -23,6 +23,7 @@ from sgwarp.reconstruction.fitting.checkpoint import Checkpoint, fingerprint
 from sgwarp.reconstruction.fitting.coverage import seen_by_any
 from sgwarp.reconstruction.fitting.densify import Densify
 from sgwarp.reconstruction.fitting.exposure import Exposure
+from sgwarp.reconstruction.fitting.held_out_poses import refine_held_out_poses
 from sgwarp.reconstruction.fitting.mcmc import MarkovChain
 from sgwarp.reconstruction.fitting.measurement import Measurement
 from sgwarp.reconstruction.fitting.model import Gradients, Model
@@ -202,6 +203,10 @@ class Loop:
             return torch.ones(3, device=self.device)
         return torch.rand(3, generator=generator(self.settings.seed, self.step, "background")).to(self.device)
 
+    def _shown_behind(self) -> Tensor | None:
+        """The background that is measured with."""
+        return torch.ones(3, device=self.device) if self.settings.background == "white" else None
+
     def measure(self) -> dict[str, float]:
         """PSNR of each held-out view, and a point of the curve."""
         values = self._psnr_of(self.held_out, [photograph.camera for photograph in self.held_out])
@@ -209,6 +214,14 @@ class Loop:
         if not self.curve or self.curve[-1].step != self.step:
             self.curve.append(Measurement(self.step, self.seconds, mean, self.loss, len(self.model)))
         return {photograph.stem: value for photograph, value in zip(self.held_out, values, strict=True)}
+
+    def measure_refined(self, report: Report) -> tuple[dict[str, float], list[Camera]]:
+        """PSNR of each held-out view from a pose refined to the scene as it is [dB], and its camera."""
+        gaussians, share = self.model.gaussians(), self.settings.similarity_share
+        with self.log.stage("held-out poses"):
+            cameras = refine_held_out_poses(gaussians, self.held_out, self._shown_behind(), share, report)
+        values = self._psnr_of(self.held_out, cameras)
+        return {photograph.stem: value for photograph, value in zip(self.held_out, values, strict=True)}, cameras
 
     def measure_fitted(self) -> float:
         """Mean PSNR of the views that are fitted, of at most 64 of them [dB]."""
@@ -224,7 +237,7 @@ class Loop:
     def _psnr_of(self, photographs: Sequence[Photograph], cameras: Sequence[Camera]) -> list[float]:
         """PSNR of the renderings of each photograph [dB]."""
         gaussians = self.model.gaussians()
-        background = torch.ones(3, device=self.device) if self.settings.background == "white" else None
+        background = self._shown_behind()
         values = []
         with self.log.stage("measure"):
             for photograph, camera in zip(photographs, cameras, strict=True):

@@ -33,6 +33,7 @@ class FitSettings:
         sparse: Update only the Gaussians that a step's view has seen.
         exposure: Also fit an affine map of the colours for every photograph.
         refine_poses: Also fit a small rigid motion of every camera.
+        refine_held_out: Also measure with the poses of held-out views fitted to the finished scene.
         seed: Of everything random.
         evaluate_every: Steps between two measurements on the held-out views.
         refine_every: Steps between two refinements of the set of Gaussians.
@@ -54,6 +55,7 @@ class FitSettings:
     sparse: bool = True
     exposure: bool = False
     refine_poses: bool = False
+    refine_held_out: bool = False
     seed: int = 0
     evaluate_every: int = 500
     refine_every: int = 100

@@ -5,7 +5,7 @@ from __future__ import annotations
 import logging
 import os
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -35,7 +35,7 @@ from sgwarp.runs.interrupt import deferred_interrupt
 from sgwarp.runs.isolation import isolated
 from sgwarp.runs.log import RunLog
 from sgwarp.runs.progress import Report
-from sgwarp.scene import Gaussians, View
+from sgwarp.scene import Camera, Gaussians, View
 
 logger = logging.getLogger("sgwarp")
 EXTENT = 1.0  # of the cameras, in the frame that scenes are fitted in
@@ -49,11 +49,14 @@ class Fitted:
     Attributes:
         gaussians: The scene.
         curve: Measurements on the way, the last one of `gaussians`.
-        held_out: PSNR of each held-out view by its stem [dB].
+        held_out: PSNR of each held-out view by its stem [dB], from the pose that it came with.
         fitted_psnr: Mean PSNR of the views that it was fitted to [dB]; far above that of the held-out ones, it is
             overfitted.
         complete: False if it was interrupted.
         views: The views that it was fitted to, with their poses refined if that was asked for.
+        held_out_refined: PSNR of each held-out view from a pose refined to the finished scene [dB]; empty if that was
+            not asked for.
+        held_out_views: The held-out views with these poses; as they came if that was not asked for.
     """
 
     gaussians: Gaussians
@@ -62,6 +65,8 @@ class Fitted:
     fitted_psnr: float
     complete: bool
     views: tuple[View, ...] = ()
+    held_out_refined: dict[str, float] = field(default_factory=dict)
+    held_out_views: tuple[View, ...] = ()
 
 
 @isolated
@@ -90,7 +95,8 @@ def fit(
         views: Posed photographs to fit to, at least 3.
         start: What to start from: points (positions [N, 3], colours [N, 3] in [0, 1]) as `load_points` returns them, a
             scene, such as `gaussians_from_depth` returns, or None for random points in front of the cameras.
-        held_out: Posed photographs to measure on; nothing is fitted to them.
+        held_out: Posed photographs to measure on; nothing is fitted to them, but their poses if
+            `settings.refine_held_out`, and these after the scene.
         settings: Steps, strategy, cap and everything else.
         downscale: Divide width and height of the photographs by this.
         largest: Photographs that are then wider or higher are scaled down to this [pixels]; 0 for none.
@@ -154,15 +160,28 @@ def fit(
     if complete:
         run.remove_unseen()
     measured, on_fitted = run.measure(), run.measure_fitted()
+    refined: dict[str, float] = {}
+    shown_by = [photograph.camera for photograph in shown]
+    if complete and settings.refine_held_out and shown:
+        refined, shown_by = run.measure_refined(report)
     if path is not None and complete and not keep_checkpoint:
         path.unlink(missing_ok=True)
-    used = {photograph.stem: camera for photograph, camera in zip(photographs, run.cameras(), strict=True)}
-    fitted_to = tuple(view for view in views if view.stem in used)
-    if settings.refine_poses:
-        fitted_to = tuple(frame.with_pose(view, used[view.stem]) for view in fitted_to)
+    fitted_to = _with_poses(frame, views, photographs, run.cameras() if settings.refine_poses else None)
+    measured_on = _with_poses(frame, held_out, shown, shown_by if refined else None)
     result = frame.restored(run.model.gaussians())
     log.watch(lambda: result)
-    return Fitted(result, run.curve, measured, on_fitted, complete, fitted_to)
+    return Fitted(result, run.curve, measured, on_fitted, complete, fitted_to, refined, measured_on)
+
+
+def _with_poses(
+    frame: Frame, views: Sequence[View], photographs: Sequence[Photograph], cameras: Sequence[Camera] | None
+) -> tuple[View, ...]:
+    """The views whose photographs are used, with the poses of cameras of the frame, or as they came."""
+    if cameras is None:
+        used = {photograph.stem for photograph in photographs}
+        return tuple(view for view in views if view.stem in used)
+    refined = {photograph.stem: camera for photograph, camera in zip(photographs, cameras, strict=True)}
+    return tuple(frame.with_pose(view, refined[view.stem]) for view in views if view.stem in refined)
 
 
 def _starting(
