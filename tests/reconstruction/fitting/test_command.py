@@ -64,6 +64,9 @@ def test_refined_poses_are_a_data_set(boards, tmp_path):
     assert min(shifts) > 0
     assert max(shifts) < 0.1
     assert str(tmp_path / "scene.ply.refined" / "transforms.json") in (tmp_path / "run.json").read_text()
+    error = json.loads((tmp_path / "run.json").read_text())["error"]
+    assert error["held_out_psnr"] != error["held_out_psnr_refined_poses"]
+    assert error["overfitting_gap"] == pytest.approx(error["fitted_psnr"] - error["held_out_psnr_refined_poses"])
 
 
 def test_the_contact_sheet_shows_truth_rendering_and_difference(boards, tmp_path):
