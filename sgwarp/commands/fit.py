@@ -219,6 +219,7 @@ class Fit(Options):
         if not given.exists():
             raise InputError(f"{given}: no such file or folder; check the path")
         from sgwarp.io.colmap_model import find_model
+        from sgwarp.io.foreign_captures import describe_capture
         from sgwarp.reconstruction.sfm.poses import photographs_in
         from sgwarp.reconstruction.sfm.video import is_video
 
@@ -226,6 +227,8 @@ class Fit(Options):
             posed = given.is_file() or any((given / name).is_file() for name in TRANSFORMS) or find_model(given)
             if posed or not photographs_in(given):
                 return given
+        if given.is_dir() and (known := describe_capture(given)):
+            logger.warning("%s: %s", given, known)
         made = self.out.with_name(f"{self.out.name}.sfm")
         logger.info("%s: holds no poses; they are found by structure from motion, and kept in %s", given, made)
         find_poses(given, made, log, seed=self.seed)

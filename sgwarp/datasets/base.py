@@ -20,7 +20,7 @@ from torch import Tensor
 from sgwarp.errors import InputError
 from sgwarp.files.documents import read_json
 from sgwarp.files.images import read_rgb, read_size
-from sgwarp.io.stems import IMAGE_SUFFIXES
+from sgwarp.io.stems import is_image_name
 from sgwarp.scene import View
 
 TRAINED = ("scene.ply", "point_cloud.ply", "splat.ply")  # in a scene's folder
@@ -142,7 +142,7 @@ def images_in(folder: Path) -> list[Path]:
     """Images in a folder, sorted by name; none if there is no folder."""
     if not folder.is_dir():
         return []
-    return sorted(path for path in folder.iterdir() if path.suffix in IMAGE_SUFFIXES and path.name[0] != ".")
+    return sorted(path for path in folder.iterdir() if is_image_name(path) and path.name[0] != ".")
 
 
 def folders_in(folder: Path) -> list[Path]:

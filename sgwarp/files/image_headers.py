@@ -16,6 +16,15 @@ from sgwarp.errors import InputError
 PNG_SIGNATURE = b"\x89PNG\r\n\x1a\n"
 JPEG_SIGNATURE = b"\xff\xd8\xff"
 TIFF_SIGNATURES = {b"II*\0": "<", b"MM\0*": ">"}
+# Place, bytes and name of formats that people have and that are not decoded.
+NOT_DECODED = (
+    *((4, sign, "HEIC") for sign in (b"ftypheic", b"ftypheix", b"ftyphevc", b"ftypmif1", b"ftypmsf1")),
+    (4, b"ftypavif", "AVIF"),
+    *((0, sign, "JPEG XL") for sign in (b"\xff\x0a", b"\0\0\0\x0cJXL ")),
+    (0, b"GIF8", "GIF"),
+    (0, b"\x76\x2f\x31\x01", "OpenEXR"),
+    (0, b"#?RADIANCE", "HDR"),
+)
 START_OF_SCAN = 0xDA
 START_OF_FRAME = frozenset(range(0xC0, 0xD0)) - {0xC4, 0xC8, 0xCC}  # baseline, progressive, ...
 PNG_PIXELS = {0: 1, 2: 3, 3: 1, 4: 2, 6: 4}  # color type -> samples per pixel
@@ -49,7 +58,9 @@ def check_image(path: str | os.PathLike[str], data: bytes) -> tuple[int, int]:
         raise InputError(f"{path}: image is cut short (0 bytes); copy or download it again")
     size = image_size(data)
     if size is None:
-        raise InputError(f"{path}: is not an image of a known format, or is damaged; save it again as PNG or JPEG")
+        kind = next((kind for place, sign, kind in NOT_DECODED if data[place : place + len(sign)] == sign), None)
+        what = f"is a {kind} image, which is not decoded" if kind else "is not an image of a known format, or is damaged"
+        raise InputError(f"{path}: {what}; save it again as PNG or JPEG")
     height, width = size
     limit = largest_image()
     if height * width > limit:

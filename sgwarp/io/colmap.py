@@ -16,6 +16,7 @@ from sgwarp.io.colmap_model import ImageRecord, count_images, find_model, find_m
 from sgwarp.io.colmap_model import read_points as read_points
 from sgwarp.io.image_folders import find_image_folder
 from sgwarp.io.names import inside
+from sgwarp.io.photograph_files import PhotographFiles
 from sgwarp.io.photographs import LeftOut, fit_photograph, say_orientations
 from sgwarp.io.stems import unique_stems
 from sgwarp.io.undistort import Lens, Listed, pinhole_view
@@ -50,11 +51,12 @@ def read_colmap(path: str | os.PathLike[str], image_folder: str | None = None, p
     lenses = read_cameras(model)
     records = read_images(model)
     folder = find_image_folder(model, [record.name for record in records], image_folder) if photographs else None
-    left_out = LeftOut(model, "images")
-    kept = [record for record in records if _usable(record, lenses, folder, left_out)]
+    left_out, files = LeftOut(model, "images"), PhotographFiles(model, (record.name for record in records))
+    found = {r.name: files.find(inside(model, folder, r.name)) if folder is not None else None for r in records}
+    kept = [r for r in records if _usable(r, lenses, folder is None or found[r.name] is not None, left_out)]
     views, used = [], []
     for stem, record in zip(unique_stems(model, [record.name for record in kept]), kept, strict=True):
-        image = inside(model, folder, record.name) if folder is not None else None
+        image = found[record.name]
         lens, pose, orientation = lenses[record.camera_id], _world_to_camera(record), UPRIGHT
         assert isinstance(lens, Lens)
         assert pose is not None
@@ -75,22 +77,23 @@ def read_colmap(path: str | os.PathLike[str], image_folder: str | None = None, p
             f"are not in {folder}, {left_out.count(UNPOSED)} poses hold NaN or infinity"
         )
     left_out.say()
+    files.say()
     say_orientations(model, used)
     return views
 
 
-def _usable(record: ImageRecord, lenses: dict[int, Lens | InputError], folder: Path | None, left_out: LeftOut) -> bool:
+def _usable(record: ImageRecord, lenses: dict[int, Lens | InputError], exists: bool, left_out: LeftOut) -> bool:
     """Whether an image has a camera, a pose and a photograph; if not, why is noted.
 
     Raises:
-        InputError: It refers to a camera that is not listed, or to a file outside the folder of photographs.
+        InputError: It refers to a camera that is not listed.
     """
     if record.camera_id not in lenses:
         raise InputError(
             f"{left_out.source}: image {record.name!r} refers to camera {record.camera_id}, which is not listed"
         )
     lens = lenses[record.camera_id]
-    if folder is not None and not os.path.isfile(inside(left_out.source, folder, record.name)):
+    if not exists:
         left_out.add(MISSING, record.name)
     elif _world_to_camera(record) is None:
         left_out.add(UNPOSED, record.name)

@@ -16,13 +16,12 @@ from numpy.typing import NDArray
 
 from sgwarp.errors import InputError
 from sgwarp.files.access import read_bytes, reading
-from sgwarp.io.lens_models import COLMAP_MODELS
+from sgwarp.io.lens_models import COLMAP_MODELS, PANORAMA, PANORAMA_REMEDY
 from sgwarp.io.undistort import Lens
 
-# By the number in the binary format; the last shows all around, which no pinhole image can.
-MODEL_NAMES = (*COLMAP_MODELS, "EQUIRECTANGULAR")
+MODEL_NAMES = (*COLMAP_MODELS, PANORAMA)  # by the number in the binary format
 PARAMETER_COUNTS = {name: focals + 2 + count for name, (_, focals, count) in COLMAP_MODELS.items()}
-PARAMETER_COUNTS["EQUIRECTANGULAR"] = 2
+PARAMETER_COUNTS[PANORAMA] = 2
 GREY = 128.0
 PLACES = ("sparse", "colmap/sparse", "dense/sparse", "dense/0/sparse", "distorted/sparse", ".")
 MOST_FIELDS = 32  # of a camera; more are one that is no number
@@ -113,8 +112,14 @@ def count_images(model: Path) -> int:
             if suffix == ".bin":
                 count = int.from_bytes(file.read(8), "little")
                 return min(count, path.stat().st_size // RECORD_BYTES["images"])
-            return sum(1 for line in file if len(line.split()) >= 10 and not line.lstrip().startswith(b"#"))
+            return sum(map(_is_image_line, file))
     return 0
+
+
+def _is_image_line(line: bytes) -> bool:
+    """Whether a line of images.txt lists an image, and not observations or a comment."""
+    fields = line.split()
+    return len(fields) >= 10 and not fields[0].startswith(b"#") and not _are_observations(line.decode("utf-8", "replace"))
 
 
 def _folders(place: Path) -> list[Path]:
@@ -151,10 +156,8 @@ def _lens_or_error(where: str, model: str, width: int, height: int, values: tupl
 def _lens(where: str, model: str, width: int, height: int, values: tuple[float, ...]) -> Lens:
     model = model.upper()
     if model not in COLMAP_MODELS:
-        remedy = "run COLMAP's image_undistorter first"
-        if model == "EQUIRECTANGULAR":
-            remedy = "cut the panoramas into perspective images first (COLMAP's panorama_sfm.py does)"
-        raise InputError(f"{where}: model {model} is not supported (supported: {', '.join(COLMAP_MODELS)}); {remedy}")
+        remedy = PANORAMA_REMEDY if model == PANORAMA else "run COLMAP's image_undistorter first"
+        raise InputError(f"{where}: model {model} is not supported; {remedy} (supported: {', '.join(COLMAP_MODELS)})")
     if len(values) != PARAMETER_COUNTS[model]:
         raise InputError(f"{where}: model {model} has {PARAMETER_COUNTS[model]} parameters, found {len(values)}")
     kind, focals, _ = COLMAP_MODELS[model]

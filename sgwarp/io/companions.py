@@ -20,7 +20,7 @@ from collections.abc import Iterator, Sequence
 from pathlib import Path, PurePosixPath
 
 from sgwarp.errors import InputError
-from sgwarp.io.stems import IMAGE_SUFFIXES
+from sgwarp.io.stems import is_image_name
 from sgwarp.scene import View
 
 PICTURES = (".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff", ".webp")
@@ -94,4 +94,4 @@ def _tails(view: View) -> Iterator[str]:
 
 def _without_suffix(name: str) -> str:
     path = PurePosixPath(name)
-    return str(path.with_suffix("")) if path.suffix in IMAGE_SUFFIXES else name
+    return str(path.with_suffix("")) if is_image_name(path) else name

@@ -23,6 +23,8 @@ LensModel = Literal[
     "eucm",  # alpha beta
 ]
 TINY = 1e-12
+PANORAMA = "EQUIRECTANGULAR"  # shows all around, which no pinhole image can
+PANORAMA_REMEDY = "cut the panoramas into perspective images first (pycolmap's example panorama_sfm.py does)"
 # COLMAP's name: model here, number of focal lengths, number of coefficients.
 COLMAP_MODELS: dict[str, tuple[LensModel, int, int]] = {
     "SIMPLE_PINHOLE": ("perspective", 1, 0),

@@ -22,6 +22,11 @@ def inside(source: str | os.PathLike[str], folder: Path, name: str) -> Path:
         InputError: The name leads out of the folder.
     """
     path = PurePosixPath(name.replace("\\", "/"))
+    if path.is_absolute():
+        try:  # a file of the data set by its whole path
+            path = PurePosixPath(Path(path).relative_to(folder.absolute()))
+        except ValueError:
+            pass
     depth = 0
     for part in path.parts:
         depth += -1 if part == ".." else 1

@@ -4,11 +4,17 @@ from __future__ import annotations
 
 import os
 from collections.abc import Sequence
-from pathlib import PurePosixPath
+from pathlib import PurePath, PurePosixPath
 
 from sgwarp.errors import InputError
 
-IMAGE_SUFFIXES = (".png", ".jpg", ".jpeg", ".PNG", ".JPG", ".JPEG")
+IMAGE_ENDINGS = (".png", ".jpg", ".jpeg", ".webp", ".tif", ".tiff", ".bmp")
+IMAGE_SUFFIXES = (*IMAGE_ENDINGS, *(ending.upper() for ending in IMAGE_ENDINGS))
+
+
+def is_image_name(path: PurePath) -> bool:
+    """Whether a file is named like an image that can be read."""
+    return path.suffix.lower() in IMAGE_ENDINGS
 
 
 def unique_stems(source: str | os.PathLike[str], names: Sequence[str]) -> list[str]:
@@ -40,4 +46,4 @@ def unique_stems(source: str | os.PathLike[str], names: Sequence[str]) -> list[s
 
 def _without_extension(name: str) -> PurePosixPath:
     path = PurePosixPath(name.replace("\\", "/"))
-    return path.with_suffix("") if path.suffix in IMAGE_SUFFIXES else path
+    return path.with_suffix("") if is_image_name(path) else path

@@ -16,10 +16,11 @@ from sgwarp.errors import InputError
 from sgwarp.files.documents import read_json
 from sgwarp.files.exif import UPRIGHT
 from sgwarp.files.images import read_size
-from sgwarp.io.lens_models import COLMAP_MODELS, LensModel
+from sgwarp.io.lens_models import COLMAP_MODELS, PANORAMA, PANORAMA_REMEDY, LensModel
 from sgwarp.io.names import inside
 from sgwarp.io.photographs import LeftOut, fit_photograph, say_orientations
-from sgwarp.io.stems import IMAGE_SUFFIXES, unique_stems
+from sgwarp.io.photograph_files import PhotographFiles
+from sgwarp.io.stems import unique_stems
 from sgwarp.io.undistort import Lens, Listed, pinhole_view
 from sgwarp.scene import View
 
@@ -37,7 +38,18 @@ RATIONAL = ("k4", "k5", "k6")  # of FULL_OPENCV alone
 MISSING, UNPOSED = "without photograph", "whose pose holds NaN or infinity"
 DEPTH_UNIT, MILLIMETER = "depth_unit_scale_factor", 1e-3
 BELONGINGS = ("mask_path", "depth_file_path")
-IGNORED = ("train_filenames", "val_filenames", "test_filenames", "semantics_path", "normal_file_path", "exposure")
+IGNORED = (
+    *("train_filenames", "val_filenames", "test_filenames", "semantics_path", "normal_file_path", "exposure"),
+    *("depth_path", "rolling_shutter", "fisheye_crop_radius", "radial_lens"),
+)
+# What instant-ngp and nerfstudio know and no pinhole image can show, and what to do.
+OTHER_LENSES = {
+    "latlong": PANORAMA_REMEDY,
+    "equirectangular": PANORAMA_REMEDY,
+    "ftheta_p0": "undistort the photographs first",
+    "from_mitsuba": "its axes are not OpenGL's; turn the cameras about their y axis by 180 degrees and take it out",
+}
+SPLITS = ("transforms_test.json", "transforms_val.json")
 OPENGL_TO_OPENCV = np.diag([1.0, -1.0, -1.0, 1.0])  # camera y up, z back -> y down, z forward
 RIGID_TOLERANCE = 1e-3
 MAX_NUMBER = 1e100  # JSON knows integers that no float can hold
@@ -64,13 +76,15 @@ def read_transforms(path: str | os.PathLike[str], photographs: bool = True) -> l
     path = Path(path)
     meta = _parse(path)
     left_out = LeftOut(path, "frames")
+    files = PhotographFiles(path, (f.get("file_path") for f in meta["frames"] if isinstance(f, dict)))
     kept: list[tuple[int, Fields, NDArray[np.float64], Path | None]] = []
+    _refuse_other_lenses(path, meta)
     for index, frame in enumerate(meta["frames"]):
         where = f"{path}: frame {index}"
         name = frame.get("file_path") if isinstance(frame, dict) else None
         if not isinstance(name, str) or not name:
             raise InputError(f"{where}: has no 'file_path'; name the photograph it belongs to")
-        image = _find_image(path, name) if photographs else None
+        image = files.find(inside(path, path.parent, name)) if photographs else None
         if photographs and image is None:
             left_out.add(MISSING, name)
             continue
@@ -103,6 +117,7 @@ def read_transforms(path: str | os.PathLike[str], photographs: bool = True) -> l
             "infinity"
         )
     left_out.say()
+    files.say()
     say_orientations(path, used)
     _say_ignored(path, meta)
     return views
@@ -151,10 +166,26 @@ def _say_ignored(path: Path, meta: Fields) -> None:
                 "%s: %d of %d files that its frames name as %s do not exist, first %s",
                 *(path, len(absent), len(named), key, absent[0]),
             )
-    ignored = [key for key in IGNORED if meta.get(key)]
-    ignored += [f"{key} of the frames" for key in IGNORED if any(frame.get(key) for frame in meta["frames"])]
+    ignored = [key for key in IGNORED if _says(meta.get(key))]
+    ignored += [f"{key} of the frames" for key in IGNORED if any(_says(frame.get(key)) for frame in meta["frames"])]
+    beside = [name for name in SPLITS if path.name == "transforms_train.json" and (path.parent / name).is_file()]
+    if beside:
+        logging.getLogger("sgwarp").info("%s: is read alone; give %s by name to read that", path, " or ".join(beside))
     if ignored:
         logging.getLogger("sgwarp").warning("%s: not used: %s", path, ", ".join(dict.fromkeys(ignored)))
+
+
+def _says(value: Any) -> bool:
+    """Whether a field holds more than nothing, zeros or a negative number that stands for nothing."""
+    numbers = value if isinstance(value, list) else [value]
+    return any(not (isinstance(n, (int, float)) and n <= 0) and bool(n) for n in numbers)
+
+
+def _refuse_other_lenses(path: Path, meta: Fields) -> None:
+    """Raise InputError where the file asks for a lens or axes that would otherwise be silently taken for others."""
+    for key, remedy in OTHER_LENSES.items():
+        if meta.get(key) or any(isinstance(frame, dict) and frame.get(key) for frame in meta["frames"]):
+            raise InputError(f"{path}: '{key}' is not supported; {remedy}")
 
 
 def _parse(path: Path) -> dict[str, Any]:
@@ -164,12 +195,6 @@ def _parse(path: Path) -> dict[str, Any]:
     if not meta["frames"]:
         raise InputError(f"{path}: its list 'frames' is empty; it must name at least one photograph")
     return meta
-
-
-def _find_image(transforms: Path, name: str) -> Path | None:
-    listed = inside(transforms, transforms.parent, name)
-    candidates = (listed, *(listed.with_name(listed.name + suffix) for suffix in IMAGE_SUFFIXES))
-    return next((path for path in candidates if os.path.isfile(path)), None)
 
 
 def _world_to_camera(where: str, matrix: Any) -> NDArray[np.float64] | None:
@@ -232,16 +257,18 @@ def _lens(where: str, frame: Fields, meta: Fields, size: tuple[int, int] | None)
         return 0.5 * extent / math.tan(0.5 * value)
 
     model = frame.get("camera_model", meta.get("camera_model", "OPENCV"))
-    if not isinstance(model, str) or model not in COLMAP_MODELS:
-        supported = ", ".join(COLMAP_MODELS)
+    name = model.upper() if isinstance(model, str) else ""
+    name = "OPENCV" if name == "PERSPECTIVE" else name  # as nerfstudio calls it in other places
+    if name not in COLMAP_MODELS:
+        remedy = PANORAMA_REMEDY if name == PANORAMA else "undistort the photographs first"
         raise InputError(
-            f"{where}: camera_model {model!r} is not supported (supported: {supported}); undistort it first"
+            f"{where}: camera_model {model!r} is not supported; {remedy} (supported: {', '.join(COLMAP_MODELS)})"
         )
-    kind: LensModel = COLMAP_MODELS[model][0]
+    kind: LensModel = COLMAP_MODELS[name][0]
     if kind == "perspective" and frame.get("is_fisheye", meta.get("is_fisheye", False)):
         kind = "fisheye"
     distortion = tuple(found[1] if (found := number(key)) else 0.0 for key in COEFFICIENTS[kind])
-    if kind == "perspective" and model != "FULL_OPENCV":
+    if kind == "perspective" and name != "FULL_OPENCV":
         for key in RATIONAL:
             if (found := number(key)) and found[1] != 0:
                 raise InputError(f"{where}: '{key}' is not defined for camera_model {model}; correct the camera model")

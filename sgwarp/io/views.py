@@ -7,6 +7,7 @@ from pathlib import Path
 
 from sgwarp.errors import InputError
 from sgwarp.io.colmap import find_model, read_colmap
+from sgwarp.io.foreign_captures import describe_capture, describe_unread
 from sgwarp.io.transforms import read_transforms
 from sgwarp.io.world import TRANSFORMS, moved_near_origin
 from sgwarp.scene import View
@@ -39,9 +40,12 @@ def load_views(path: str | os.PathLike[str], image_folder: str | None = None, ph
             raise InputError(f"{transforms}: lists its photographs by path; --images is for COLMAP models only")
         return _placed(path, read_transforms(transforms, photographs))
     if find_model(path) is None:
+        if known := describe_capture(path) or describe_unread(path):
+            raise InputError(f"{path}: {known}")
         raise InputError(
             f"{path}: holds no views; looked for {', '.join(TRANSFORMS)} and for a COLMAP model (cameras.bin or "
-            "cameras.txt) in sparse/0, sparse, colmap/sparse/0 and the folder itself"
+            "cameras.txt) in sparse/0, sparse, colmap/sparse/0 and the folder itself; photographs alone get poses by "
+            "`sgwarp poses`"
         )
     return _placed(path, read_colmap(path, image_folder, photographs))
 

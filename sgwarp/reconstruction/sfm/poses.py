@@ -6,17 +6,19 @@ import hashlib
 import json
 import logging
 import os
+import re
 import shutil
-from collections.abc import Sequence
+from collections.abc import Sequence, Set
 from dataclasses import asdict, dataclass, field
-from pathlib import Path
+from pathlib import Path, PurePosixPath
 from typing import Any
 
 from sgwarp.errors import InputError
 from sgwarp.files.access import reading
 from sgwarp.files.atomic import atomic_path
 from sgwarp.files.documents import read_json
-from sgwarp.io.stems import IMAGE_SUFFIXES
+from sgwarp.io.foreign_captures import describe_unread
+from sgwarp.io.stems import is_image_name
 from sgwarp.reconstruction.sfm.features import (
     SfmSettings,
     choose_pairs,
@@ -31,6 +33,8 @@ logger = logging.getLogger("sgwarp")
 MODEL = Path("sparse") / "0"
 NOTES = "sfm.json"
 LEAST_PHOTOGRAPHS = 3
+# Folders of what belongs to photographs, without a final s; Polycam's corrected copies show each photograph again.
+BESIDE = frozenset(("mask", "depth", "label", "semantic", "normal", "confidence", "segmentation", "corrected_image"))
 FEW_FEATURES = 200  # in a photograph: blurred, dark, or of something even
 FEW_MATCHES = 30  # with any other photograph
 LEAST_ANGLE = 4.0  # between the first two photographs where none have COLMAP's 16 [degrees]
@@ -62,10 +66,25 @@ class Registration:
 
 
 def photographs_in(folder: Path) -> list[str]:
-    """Names of the photographs in a folder and its subfolders, relative to it, in order."""
+    """Names of the photographs in a folder and its subfolders, relative to it, in order.
+
+    Folders of what belongs to photographs (masks, depth, labels) are left out, and so are smaller copies of another
+    folder (images_4 beside images) and hidden files.
+    """
     with reading(folder):
-        files = sorted(path for path in folder.rglob("*") if path.suffix in IMAGE_SUFFIXES and path.is_file())
-    return [path.relative_to(folder).as_posix() for path in files]
+        files = [path for path in folder.rglob("*") if is_image_name(path) and path.is_file()]
+    names = sorted(path.relative_to(folder).as_posix() for path in files)
+    names = [name for name in names if not any(part.startswith(".") for part in PurePosixPath(name).parts)]
+    places = {PurePosixPath(name).parent for name in names}
+    return [name for name in names if not _belongs_to_others(PurePosixPath(name).parent, places)] or names
+
+
+def _belongs_to_others(place: PurePosixPath, places: Set[PurePosixPath]) -> bool:
+    """Whether a folder holds no photographs of its own, by its name."""
+    copy = re.fullmatch(r"(.+)_[248]", place.name)
+    if copy is not None and place.with_name(copy[1]) in places:
+        return True
+    return any(part.lower().rstrip("s") in BESIDE for part in place.parts)
 
 
 def estimate_poses(
@@ -90,6 +109,8 @@ def estimate_poses(
     settings, report = settings or SfmSettings(), progress or (lambda done, total, text: None)
     names = photographs_in(folder)
     require_photographs(folder, names, LEAST_PHOTOGRAPHS)
+    if unread := describe_unread(folder):
+        logger.warning("%s: %s", folder, unread)
     out.mkdir(parents=True, exist_ok=True)
     own = _fingerprint(folder, names, settings)
     known = _read_notes(out)

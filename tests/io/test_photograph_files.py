@@ -1,0 +1,158 @@
+"""Photographs that are not quite where a data set says, and those that are not read at all."""
+
+import json
+import logging
+import shutil
+
+import cv2
+import numpy as np
+import pytest
+
+from sgwarp.errors import InputError
+from sgwarp.io.views import load_views
+from sgwarp.reconstruction.sfm.poses import photographs_in
+
+POSE = np.eye(4).tolist()
+
+
+def photograph(path, value=0):
+    path.parent.mkdir(parents=True, exist_ok=True)
+    cv2.imwrite(str(path), np.full((24, 32, 3), value, np.uint8))
+
+
+def transforms(folder, names, **meta):
+    frames = [{"file_path": name, "transform_matrix": POSE} for name in names]
+    folder.mkdir(parents=True, exist_ok=True)
+    (folder / "transforms.json").write_text(json.dumps({"fl_x": 40.0, "w": 32, "h": 24, **meta, "frames": frames}))
+
+
+def colmap(folder, names):
+    (folder / "sparse/0").mkdir(parents=True, exist_ok=True)
+    (folder / "sparse/0/cameras.txt").write_text("1 PINHOLE 32 24 40 40 16 12\n")
+    rows = [f"{number} 1 0 0 0 0 0 0 1 {name}\n\n" for number, name in enumerate(names, 1)]
+    (folder / "sparse/0/images.txt").write_text("".join(rows))
+
+
+@pytest.mark.parametrize("write", [lambda f, names: transforms(f, [f"images/{n}" for n in names]), colmap])
+@pytest.mark.parametrize(
+    ("listed", "stored"),
+    [("a b.png", "a b.PNG"), ("IMG_1.JPG", "img_1.png"), ("one.jpg", "one.webp"), ("cam0/x.png", "cam0/x.tiff")],
+)
+def test_another_ending_or_letter_case_is_found_and_said(tmp_path, caplog, write, listed, stored):
+    photograph(tmp_path / "images" / stored, 70)
+    photograph(tmp_path / "images" / "other.png")
+    write(tmp_path, [listed, "other.png"])
+    first, _ = sorted(load_views(tmp_path), key=lambda view: view.name.endswith("other.png"))
+    assert round(float(first.image().mean()) * 255) in (69, 70, 71)
+    assert first.stem == listed.rsplit("/")[-1].rsplit(".")[0]
+    assert "1 photographs have another ending or letter case than is listed, first" in caplog.text
+
+
+def test_no_photograph_is_taken_twice(tmp_path, caplog):
+    """b.jpg is gone; b.png is listed itself, so that it does not stand in."""
+    photograph(tmp_path / "images/a.png")
+    photograph(tmp_path / "images/b.png")
+    transforms(tmp_path, ["images/b.png", "images/b.jpg", "images/a.png"])
+    assert [view.stem for view in load_views(tmp_path)] == ["b", "a"]
+    assert "left out 1 frames without photograph" in caplog.text
+
+
+def test_two_files_that_may_be_meant_are_neither(tmp_path):
+    photograph(tmp_path / "images/a.png")
+    photograph(tmp_path / "images/a.bmp")
+    photograph(tmp_path / "images/b.png")
+    transforms(tmp_path, ["images/a.jpg", "images/b.png"])
+    assert [view.stem for view in load_views(tmp_path)] == ["b"]
+
+
+def test_whole_paths_into_the_data_set_are_taken(tmp_path):
+    photograph(tmp_path / "images/a.png")
+    transforms(tmp_path, [str(tmp_path / "images/a.png")])
+    assert len(load_views(tmp_path)) == 1
+    transforms(tmp_path / "inner", [f"{tmp_path}/inner/../images/a.png"])
+    with pytest.raises(InputError, match="lies outside the data set"):
+        load_views(tmp_path / "inner")
+
+
+@pytest.mark.parametrize(
+    ("file", "content", "expected"),
+    [
+        ("poses_bounds.npy", b"", "LLFF"),
+        ("keyframes/cameras/1.json", b"{}", "Polycam.*ns-process-data polycam"),
+        ("pose/0.txt", b"1 0 0 0", "ScanNet"),
+        ("cams.xml", b"<?xml ?><document><chunk><cameras>", "Metashape"),
+        ("cams.csv", b"#name,x,y,alt", "RealityCapture"),
+        ("notes.csv", b"name,weight", "holds no views.*sgwarp poses"),
+        ("scene.log", b"0 0 0\n1 0 0 0\n", "Tanks and Temples"),
+        ("run.log", b"began 1 2 3\n", "holds no views"),
+        ("IMG_1.HEIC", b"", r"not decoded \(1 HEIC files\); convert them to JPEG"),
+    ],
+)
+def test_captures_that_are_not_read_are_named(tmp_path, file, content, expected):
+    photograph(tmp_path / "photos/a.png")
+    (tmp_path / file).parent.mkdir(parents=True, exist_ok=True)
+    (tmp_path / file).write_bytes(content)
+    with pytest.raises(InputError, match=expected):
+        load_views(tmp_path)
+
+
+def test_only_photographs_are_taken_for_photographs(tmp_path):
+    """Masks, depth and smaller copies beside them are not; where there is nothing else, they are what was meant."""
+    for name in ("images/a.png", "images/sub/b.JPG", "images_4/a.png", "masks/a.png", "depth/a.png", "._a.png"):
+        photograph(tmp_path / "all" / name)
+    photograph(tmp_path / "all/Labels/0.webp")
+    photograph(tmp_path / "room_2/c.tif")
+    assert photographs_in(tmp_path / "all") == ["images/a.png", "images/sub/b.JPG"]
+    assert photographs_in(tmp_path / "all/masks") == ["a.png"]
+    assert photographs_in(tmp_path / "room_2") == ["c.tif"]
+    shutil.rmtree(tmp_path / "all/images")
+    assert photographs_in(tmp_path / "all") == ["images_4/a.png"]
+
+
+@pytest.mark.parametrize(
+    ("fields", "expected"),
+    [
+        ({"latlong": True}, "'latlong' is not supported; cut the panoramas into perspective images"),
+        ({"ftheta_p0": 0.1}, "'ftheta_p0' is not supported; undistort"),
+        ({"from_mitsuba": True}, "'from_mitsuba' is not supported; its axes"),
+        ({"camera_model": "EQUIRECTANGULAR"}, "not supported; cut the panoramas into perspective images"),
+    ],
+)
+def test_lenses_that_no_pinhole_stands_for_are_refused(tmp_path, fields, expected):
+    photograph(tmp_path / "a.png")
+    transforms(tmp_path, ["a.png"], **fields)
+    with pytest.raises(InputError, match=expected):
+        load_views(tmp_path)
+
+
+def test_what_says_nothing_is_not_refused_and_what_is_not_used_is_said(tmp_path, caplog):
+    photograph(tmp_path / "a.png")
+    transforms(tmp_path, ["a.png"], latlong=False, from_mitsuba=False, rolling_shutter=[0, 0, 0], camera_model="pinhole")
+    assert len(load_views(tmp_path)) == 1
+    assert not caplog.text
+    transforms(tmp_path, ["a.png"], rolling_shutter=[0, 0, 1], camera_model="PERSPECTIVE")
+    load_views(tmp_path)
+    assert "not used: rolling_shutter" in caplog.text
+
+
+def test_the_other_splits_are_said(tmp_path, caplog):
+    caplog.set_level(logging.INFO, logger="sgwarp")
+    photograph(tmp_path / "a.png")
+    transforms(tmp_path, ["a.png"])
+    (tmp_path / "transforms.json").rename(tmp_path / "transforms_train.json")
+    (tmp_path / "transforms_test.json").write_text("{}")
+    load_views(tmp_path)
+    assert "is read alone; give transforms_test.json by name" in caplog.text
+
+
+def test_observations_are_not_counted_as_images(tmp_path, caplog):
+    """The line of observations below an image has as many fields as one with a name."""
+    names = [f"{number}.png" for number in range(4)]
+    for name in names:
+        photograph(tmp_path / "images" / name)
+    colmap(tmp_path, names)
+    shutil.copytree(tmp_path / "sparse/0", tmp_path / "sparse/1")
+    observed = "".join(f"{n} 1 0 0 0 0 0 0 1 {name}\n{'1.0 2.0 -1 ' * 4}\n" for n, name in enumerate(names[:3], 1))
+    (tmp_path / "sparse/0/images.txt").write_text("# list\n" + observed)
+    assert len(load_views(tmp_path)) == 4
+    assert "holds 2 models (0 with 3, 1 with 4 images)" in caplog.text
