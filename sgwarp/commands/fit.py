@@ -17,6 +17,7 @@ from sgwarp.errors import InputError
 from sgwarp.runs.progress import show_progress
 
 if TYPE_CHECKING:
+    from sgwarp.reconstruction.fitting.belongings import OfView
     from sgwarp.reconstruction.fitting.photographs import Masks
     from sgwarp.reconstruction.fitting.settings import FitSettings
     from sgwarp.reconstruction.fitting.trainer import Fitted
@@ -74,15 +75,16 @@ class Fit(Options):
     """Color behind the scene."""
 
     init: Literal["auto", "points", "depth", "triangulated", "random"] = "auto"
-    """What to start from; auto: depth if --depth is given, else the data set's points if it has some, else points
-    triangulated with its poses (pycolmap), else random ones where the photographs agree. Few points are added to in
-    the same way."""
+    """What to start from; auto: depth if --depth is given or the data set names some, else the data set's points if it
+    has some, else points triangulated with its poses (pycolmap), else random ones where the photographs agree. Few
+    points are added to in the same way."""
 
     points: Path | None = None
     """File of points to start from (.ply or COLMAP's points3D), if not the data set's own."""
 
     depth: Path | None = None
-    """Folder of depth along the optical axis: {stem}.png in millimetres or {stem}.npy in metres, 0 for none."""
+    """Folder of depth along the optical axis: {stem}.png in millimetres or {stem}.npy in metres, 0 for none; if the
+    views agree on it in another unit only, that is taken and said."""
 
     masks: Path | None = None
     """Folder of {stem}.png, or of folders and names as the photographs'; what is black there does not count. If not
@@ -237,26 +239,38 @@ class Fit(Options):
 
     def _start(self, source: Path, views: list[View], settings: FitSettings, log: RunLog) -> Any:
         """Points, a scene, or None for random points."""
-        from sgwarp.reconstruction.fitting.belongings import depth_of_views
-
-        declared = depth_of_views(views)
-        if self.init == "depth" and self.depth is None and declared is None:
-            raise InputError("--init depth: needs --depth, the folder of the depth images")
-        if self.init == "auto" and self.depth is None and declared is not None:
-            logger.info("start: the data set names depth images, which are not used; --init depth starts from them")
         if self.resume or self.init == "random":  # a checkpoint holds the whole scene
             return None
         with log.stage("start"):
-            if self.init == "depth" or (self.init == "auto" and self.depth is not None):
+            if self.init in ("auto", "depth") and (depth := self._depth(views)) is not None:
                 from sgwarp.reconstruction.depth import gaussians_from_depth
-                from sgwarp.reconstruction.fitting.initial import depth_from_folder
 
-                depth = declared if self.depth is None else depth_from_folder(self.depth, views)
-                assert depth is not None
                 return gaussians_from_depth(views, depth, count=settings.cap)
             if self.init in ("auto", "points") and (points := self._points(source)) is not None:
                 return points
             return self._triangulated(views, log)
+
+    def _depth(self, views: list[View]) -> OfView | None:
+        """The depth given or that the data set names; None if --init auto finds none that it can use."""
+        from sgwarp.reconstruction.fitting.belongings import depth_from_folder, depth_of_views
+        from sgwarp.reconstruction.fitting.depth_start import usable_depth
+
+        if self.depth is not None:
+            return usable_depth(f"--depth {self.depth}", depth_from_folder(self.depth, views), views)
+        declared = depth_of_views(views)
+        if declared is None:
+            if self.init == "depth":
+                raise InputError("--init depth: needs --depth, the folder of the depth images")
+            return None
+        try:
+            depth = usable_depth(f"{self.views}: depth that it names", declared, views)
+        except InputError as error:
+            if self.init == "depth":
+                raise
+            logger.warning("%s", error)
+            return None
+        logger.info("start: from the depth images that the data set names; --init points starts without them")
+        return depth
 
     def _points(self, source: Path) -> Any:
         """Those given or the data set's own; None if --init auto finds none."""

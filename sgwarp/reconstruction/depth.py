@@ -147,6 +147,8 @@ class _Cells:
 
     def add(self, pixels: Pixels) -> None:
         """Add a view."""
+        if not len(pixels.centres):  # no depth, as of the sky
+            return
         cell = self.grid.cell
         level = self.grid.level(pixels.footprint)
         place = (pixels.centres - self.grid.low) / cell

@@ -55,7 +55,7 @@ class DepthMap:
     @property
     def points(self) -> Array:
         """Places of all pixels, [h * w, 3]."""
-        return _unproject(self.camera, self.depth)
+        return unproject(self.camera, self.depth)
 
 
 def estimate_depth(
@@ -76,7 +76,7 @@ def estimate_depth(
     small = [_shrink(image, camera) for image, camera in zip(images, cameras, strict=True)]
     cameras = [camera.resized(*image.shape[:2]) for image, camera in zip(small, cameras, strict=True)]
     gray = [np.ascontiguousarray(image.mean(axis=2)) for image in small]
-    neighbors = _neighbors(cameras, extent)
+    neighbors = choose_neighbors(cameras, extent)
     planes = extent * np.exp(np.arange(math.log(NEAREST), math.log(FARTHEST), math.log(RATIO)))
 
     def depth_of(index: int) -> Array:
@@ -103,7 +103,7 @@ def _shrink(image: Array, camera: Camera) -> Array:
     return np.asarray(cv2.resize(image, (width, height), interpolation=cv2.INTER_AREA), np.float32)
 
 
-def _neighbors(cameras: Sequence[Camera], extent: float) -> list[list[int]]:
+def choose_neighbors(cameras: Sequence[Camera], extent: float) -> list[list[int]]:
     """Of each camera, others that look about the same way from a little beside, near ones and farther ones."""
     places = np.stack([camera.position.numpy() for camera in cameras])
     axes = np.stack([camera.world_to_camera[2, :3].numpy() for camera in cameras])
@@ -176,7 +176,7 @@ def _best(costs: Array, planes: Array) -> Array:
     return (planes[level] * RATIO**offset).astype(np.float32)
 
 
-def _unproject(camera: Camera, depth: Array) -> Array:
+def unproject(camera: Camera, depth: Array) -> Array:
     y, x = np.mgrid[: camera.height, : camera.width] + 0.5
     rays = np.stack([x, y, np.ones_like(x)], axis=-1).reshape(-1, 3) @ np.linalg.inv(camera.K.numpy()).T
     pose = camera.world_to_camera.numpy()
@@ -185,7 +185,7 @@ def _unproject(camera: Camera, depth: Array) -> Array:
 
 def _confirmed(index: int, depths: Sequence[Array], cameras: Sequence[Camera]) -> Array:
     """Which pixels of a map other maps confirm, more of them than see through the point."""
-    points = _unproject(cameras[index], depths[index])
+    points = unproject(cameras[index], depths[index])
     agreeing, beyond = np.zeros(len(points), np.int32), np.zeros(len(points), np.int32)
     for other, (depth, camera) in enumerate(zip(depths, cameras, strict=True)):
         if other == index:

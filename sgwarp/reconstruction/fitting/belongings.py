@@ -75,12 +75,16 @@ def depth_from_folder(folder: Path, views: Sequence[View] | None = None) -> OfVi
 
 
 def depth_of_views(views: Sequence[View]) -> OfView | None:
-    """Depth that the data set itself names (`depth_file_path`); None if it does not name that of every view."""
-    if not views or any(view.depth_path is None for view in views):
+    """Depth that the data set itself names (`depth_file_path`); None if it names none.
+
+    What is returned raises InputError for a view without depth.
+    """
+    if all(view.depth_path is None for view in views):
         return None
 
     def depth(view: View) -> Any:
-        assert view.depth_path is not None
+        if view.depth_path is None:
+            raise InputError(f"view {view.stem}: the data set names no depth of it")
         return _read_depth(view.depth_path, view, view.depth_unit)
 
     return depth

@@ -9,6 +9,7 @@ import sys
 import time
 from pathlib import Path
 
+import numpy as np
 import pytest
 import torch
 
@@ -95,7 +96,7 @@ def test_a_fit_starts_from_depth(boards, tmp_path):
     assert run["curve"][-1]["psnr"] is None
 
 
-def test_depth_that_the_data_set_names_is_offered_and_used(boards, tmp_path, capsys):
+def test_depth_that_the_data_set_names_is_used(boards, tmp_path, capsys):
     folder = Path(shutil.copytree(boards.folder, tmp_path / "stage"))
     meta = json.loads((folder / "transforms.json").read_text())
     for frame in meta["frames"]:
@@ -103,11 +104,24 @@ def test_depth_that_the_data_set_names_is_offered_and_used(boards, tmp_path, cap
     (folder / "transforms.json").write_text(json.dumps(meta | {"depth_unit_scale_factor": 1.0}))
     options = ["--hold-out", "0", "--cap", "900", "--steps", "2", "--out"]
     assert main(["fit", str(folder), *options, str(tmp_path / "auto.ply")]) == 0
-    assert "--init depth starts from them" in capsys.readouterr().err
-    assert main(["fit", str(folder), *options, str(tmp_path / "named.ply"), "--init", "depth"]) == 0
+    assert "start: from the depth images that the data set names" in capsys.readouterr().err
     given = ["--depth", str(boards.folder / "depth")]
     assert main(["fit", str(boards.folder), *options, str(tmp_path / "given.ply"), *given]) == 0
-    assert (tmp_path / "named.ply").read_bytes() == (tmp_path / "given.ply").read_bytes()
+    assert (tmp_path / "auto.ply").read_bytes() == (tmp_path / "given.ply").read_bytes()
+
+
+def test_depth_that_contradicts_itself_is_not_started_from(boards, tmp_path, capsys):
+    folder = Path(shutil.copytree(boards.folder, tmp_path / "stage"))
+    meta = json.loads((folder / "transforms.json").read_text())
+    for number, frame in enumerate(meta["frames"]):
+        path = Path(frame["file_path"].replace("images/", "depth/").replace(".png", ".npy"))
+        frame["depth_file_path"] = str(path)
+        np.save(folder / path, np.load(folder / path) * 1.5**number)
+    (folder / "transforms.json").write_text(json.dumps(meta))
+    options = ["--hold-out", "0", "--cap", "900", "--steps", "2", "--out", str(tmp_path / "scene.ply")]
+    assert main(["fit", str(folder), *options]) == 0
+    assert "the views contradict each other" in capsys.readouterr().err
+    assert "the views contradict each other" in fails(capsys, folder, *options, "--init", "depth")
 
 
 @pytest.mark.parametrize(("strategy", "count"), [("default", 250), ("mcmc", 500)])
