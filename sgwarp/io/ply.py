@@ -109,6 +109,12 @@ def gaussians_from_elements(path: str | os.PathLike[str], elements: Elements) ->
     log = logging.getLogger("sgwarp")
     values = columns(path, vertex, needed)
     means, logits, log_scales, quats = np.split(values, np.cumsum([3, 1, len(shape)]), axis=1)
+    if bool((log_scales > 0).all()) and bool(((logits > 0) & (logits <= 1)).all()):
+        log.warning(
+            "%s: its scales are all positive and its opacities all in 0 to 1: were they stored as they are, not as "
+            "logarithms and logits? Then export it as the reference implementation does",
+            path,
+        )
     with np.errstate(over="ignore", invalid="ignore"):
         opacities = (1.0 / (1.0 + np.exp(-logits[:, 0].astype(np.float64)))).astype(np.float32)
         scales = np.exp(log_scales.astype(np.float64)).astype(np.float32)

@@ -14,14 +14,14 @@ from sgwarp.files.documents import read_json
 from sgwarp.io.compressed_ply import gaussians_from_packed, is_compressed, write_compressed_ply
 from sgwarp.io.formats.axes import GLTF_AXES, PLY_AXES, SPZ_AXES, change_axes, parse_axes
 from sgwarp.io.formats.dot_splat import read_splat, write_splat
-from sgwarp.io.formats.foreign import describe_file
+from sgwarp.io.formats.foreign import describe_file, describe_pointer
 from sgwarp.io.formats.gltf import read_gltf, write_gltf
 from sgwarp.io.formats.sog import read_sog
 from sgwarp.io.formats.spz import read_spz, write_spz
 from sgwarp.io.ply import gaussians_from_elements, read_elements, write_ply
 from sgwarp.scene import Gaussians
 
-HEAD_BYTES = 16
+HEAD_BYTES = 32
 
 
 @dataclass(frozen=True)
@@ -103,7 +103,7 @@ def find_format(path: str | os.PathLike[str]) -> SceneFormat:
     name = Path(path).name.lower()
     if head[:2] == b"PK" and name.endswith(".sog"):
         return SOG
-    if foreign := describe_file(path):
+    if foreign := describe_pointer(head) or describe_file(path):
         raise InputError(f"{path}: {foreign}")
     # By name, so that the reader says what is wrong with the file.
     form = next((form for form in FORMATS if name.endswith(form.suffixes)), None)

@@ -320,6 +320,30 @@ def test_point_cloud_is_told_apart(tmp_path, ply_bytes):
         load_gaussians(path)
 
 
+def test_values_that_were_stored_as_they_are_are_suspected(tmp_path, ply_bytes, caplog):
+    """Opacities of 0.95 and scales of 0.05 would be read as 0.72 and 1.05."""
+    rows = raw_rows(names_of(0))
+    load_gaussians(scene_file(ply_bytes, tmp_path / "usual.ply", rows))
+    assert "stored as they are" not in caplog.text
+    rows = [row | {"opacity": 0.95} | {f"scale_{axis}": 0.05 for axis in range(3)} for row in rows]
+    load_gaussians(scene_file(ply_bytes, tmp_path / "odd.ply", rows))
+    assert "odd.ply: its scales are all positive and its opacities all in 0 to 1: were they stored" in caplog.text
+
+
+@pytest.mark.parametrize(
+    ("content", "expected"),
+    [
+        (b"version https://git-lfs.github.com/spec/v1\noid sha256:0\n", "git lfs pull"),
+        (b"\n<!DOCTYPE html><html>", "is a web page, not the file itself"),
+    ],
+)
+@pytest.mark.parametrize("name", ["a.ply", "a.spz", "a.splat"])
+def test_what_was_downloaded_in_place_of_a_file_is_named(tmp_path, name, content, expected):
+    (tmp_path / name).write_bytes(content)
+    with pytest.raises(InputError, match=expected):
+        load_gaussians(tmp_path / name)
+
+
 @pytest.mark.parametrize("count", [1, 3, 8, 10, 44, 48])
 def test_wrong_number_of_coefficients(tmp_path, ply_bytes, count):
     path = scene_file(ply_bytes, tmp_path / "a.ply", raw_rows(CORE + [f"f_rest_{i}" for i in range(count)]))
@@ -370,6 +394,7 @@ def test_missing_file_folder_and_foreign(tmp_path):
     with pytest.raises(InputError, match=r"a\.ply: is not a valid PLY file"):
         load_gaussians(tmp_path / "a.ply")
     for name, message in (
+        ("a.zip", "is an archive, which is not read; unpack it"),
         ("a.ksplat", r"is \.ksplat .*; convert it to \.ply or \.spz with splat-transform"),
         ("a.las", r"is a point cloud \(\.las\), which is not read; fit a scene"),
         ("a.usdz", "is USD"),

@@ -29,6 +29,8 @@ SUFFIXES = {
     ".fbx": ("a mesh (.fbx)", "a scene of Gaussians is needed"),
     ".las": ("a point cloud (.las)", "fit a scene to photographs first: sgwarp fit"),
     ".laz": ("a point cloud (.laz)", "fit a scene to photographs first: sgwarp fit"),
+    ".e57": ("a point cloud (.e57)", "fit a scene to photographs first: sgwarp fit"),
+    ".zip": ("an archive", "unpack it and give the scene in it"),
     ".pcd": ("a point cloud (.pcd)", "fit a scene to photographs first: sgwarp fit"),
     ".xyz": ("a point cloud (.xyz)", "fit a scene to photographs first: sgwarp fit"),
     ".ckpt": ("a trainer's checkpoint", "export it as .ply with the trainer (nerfstudio: ns-export gaussian-splat)"),
@@ -36,6 +38,20 @@ SUFFIXES = {
     ".pth": ("a trainer's checkpoint", "export it as .ply with the trainer"),
     ".4dgs": ("a scene that moves (.4dgs)", "export one moment as .ply"),
 }
+
+# What is downloaded or copied in place of a file, by its first bytes.
+POINTERS = (
+    (b"version https://git-lfs", "is a pointer of Git LFS, not the file itself; run: git lfs pull"),
+    (b"/annex/objects", "is a pointer of git-annex, not the file itself; run: git annex get"),
+    (b"<!doctype html", "is a web page, not the file itself; download it again, signed in where that is asked for"),
+    (b"<html", "is a web page, not the file itself; download it again, signed in where that is asked for"),
+)
+
+
+def describe_pointer(head: bytes) -> str | None:
+    """What a file is that stands for another, by its first bytes (at least 24), and the remedy."""
+    text = head.lstrip().lower()
+    return next((what for start, what in POINTERS if text.startswith(start)), None)
 
 
 def describe_file(path: str | os.PathLike[str]) -> str | None:
