@@ -195,7 +195,9 @@ class Fit(Options):
         from sgwarp.reconstruction.sfm.poses import NOTES
 
         estimated = self.refine_poses or (source / NOTES).is_file()
-        return bool(self.hold_out) and (estimated if self.held_out_poses == "auto" else self.held_out_poses == "refined")
+        return bool(self.hold_out) and (
+            estimated if self.held_out_poses == "auto" else self.held_out_poses == "refined"
+        )
 
     @staticmethod
     def _live(views: list[View]) -> Live:
@@ -232,7 +234,9 @@ class Fit(Options):
         if given.is_dir() and (known := describe_capture(given)):
             logger.warning("%s: %s", given, known)
         made = self.out.with_name(f"{self.out.name}.sfm")
-        logger.info("%s: holds no poses; they are found by structure from motion, and kept in %s", given, made)
+        logger.info(
+            "%s: holds no poses that are read; they are found by structure from motion, and kept in %s", given, made
+        )
         find_poses(given, made, log, seed=self.seed)
         log.outputs.append(str(made))
         return made

@@ -119,7 +119,9 @@ def count_images(model: Path) -> int:
 def _is_image_line(line: bytes) -> bool:
     """Whether a line of images.txt lists an image, and not observations or a comment."""
     fields = line.split()
-    return len(fields) >= 10 and not fields[0].startswith(b"#") and not _are_observations(line.decode("utf-8", "replace"))
+    return (
+        len(fields) >= 10 and not fields[0].startswith(b"#") and not _are_observations(line.decode("utf-8", "replace"))
+    )
 
 
 def _folders(place: Path) -> list[Path]:

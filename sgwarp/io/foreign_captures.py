@@ -15,7 +15,11 @@ CAPTURES = (
     ("keyframes/cameras/*.json", "a Polycam capture", "ns-process-data polycam"),
     ("EXR_RGBD/metadata.json", "a Record3D capture", "ns-process-data record3d"),
     ("*.r3d", "a Record3D capture (.r3d)", "ns-process-data record3d"),
-    ("results/depth*.png", "a capture in Replica's layout (traj.txt)", "to a transforms.json with its camera-to-world poses"),
+    (
+        "results/depth*.png",
+        "a capture in Replica's layout (traj.txt)",
+        "to a transforms.json with its camera-to-world poses",
+    ),
     ("pose/*.txt", "a capture in ScanNet's layout (pose/*.txt)", "to a transforms.json with its camera-to-world poses"),
     ("cameras_sphere.npz", "a list of DTU cameras (cameras_sphere.npz)", "to a transforms.json"),
     ("cameras.npz", "a list of DTU cameras (cameras.npz)", "to a transforms.json"),

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import logging
 import os
+from contextlib import suppress
 from pathlib import Path, PurePosixPath
 
 from sgwarp.errors import InputError
@@ -23,10 +24,8 @@ def inside(source: str | os.PathLike[str], folder: Path, name: str) -> Path:
     """
     path = PurePosixPath(name.replace("\\", "/"))
     if path.is_absolute():
-        try:  # a file of the data set by its whole path
+        with suppress(ValueError):  # unless it is a file of the data set by its whole path
             path = PurePosixPath(Path(path).relative_to(folder.absolute()))
-        except ValueError:
-            pass
     depth = 0
     for part in path.parts:
         depth += -1 if part == ".." else 1

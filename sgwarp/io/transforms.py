@@ -18,8 +18,8 @@ from sgwarp.files.exif import UPRIGHT
 from sgwarp.files.images import read_size
 from sgwarp.io.lens_models import COLMAP_MODELS, PANORAMA, PANORAMA_REMEDY, LensModel
 from sgwarp.io.names import inside
-from sgwarp.io.photographs import LeftOut, fit_photograph, say_orientations
 from sgwarp.io.photograph_files import PhotographFiles
+from sgwarp.io.photographs import LeftOut, fit_photograph, say_orientations
 from sgwarp.io.stems import unique_stems
 from sgwarp.io.undistort import Lens, Listed, pinhole_view
 from sgwarp.scene import View

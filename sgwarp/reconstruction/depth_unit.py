@@ -104,7 +104,7 @@ class _Pairs:
         return sum(len(self.rays[i]) for i, _ in self.pairs)
 
     def agreement(self, factor: float) -> float:
-        """Share of the points that fall into other views that lie on what these see, of no fewer than a tenth of all."""
+        """Share of the points that fall into other views, or of a tenth of all, that lie on what these see."""
         close = judged = total = 0
         for i, other in self.pairs:
             total += len(self.rays[i])

@@ -127,7 +127,9 @@ def test_lenses_that_no_pinhole_stands_for_are_refused(tmp_path, fields, expecte
 
 def test_what_says_nothing_is_not_refused_and_what_is_not_used_is_said(tmp_path, caplog):
     photograph(tmp_path / "a.png")
-    transforms(tmp_path, ["a.png"], latlong=False, from_mitsuba=False, rolling_shutter=[0, 0, 0], camera_model="pinhole")
+    transforms(
+        tmp_path, ["a.png"], latlong=False, from_mitsuba=False, rolling_shutter=[0, 0, 0], camera_model="pinhole"
+    )
     assert len(load_views(tmp_path)) == 1
     assert not caplog.text
     transforms(tmp_path, ["a.png"], rolling_shutter=[0, 0, 1], camera_model="PERSPECTIVE")

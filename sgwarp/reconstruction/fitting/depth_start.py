@@ -63,14 +63,14 @@ def _factor(source: str, depths: Sequence[Any], cameras: Sequence[Any], extent: 
         return 1.0
     if found.agreement < LEAST_AGREEMENT:
         raise InputError(
-            f"{source}: the views contradict each other: in no unit more than {found.agreement:.0%} of their points lie "
-            "on the surfaces that others see; correct the depth or the poses, or start without depth"
+            f"{source}: the views contradict each other: in no unit more than {found.agreement:.0%} of their points "
+            "lie on the surfaces that others see; correct the depth or the poses, or start without depth"
         )
     if found.factor == 1:
         return 1.0
     logger.warning(
-        "%s: depth and poses are in different units: at %.5g times the depth %.0f %% of the points of a view lie on the "
-        "surfaces that others see, as given %.0f %%; the depth is multiplied by it",
+        "%s: depth and poses are in different units: at %.5g times the depth %.0f %% of the points of a view lie on "
+        "the surfaces that others see, as given %.0f %%; the depth is multiplied by it",
         *(source, found.factor, 100 * found.agreement, 100 * found.as_given),
     )
     return found.factor

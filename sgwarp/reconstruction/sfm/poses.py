@@ -8,7 +8,7 @@ import logging
 import os
 import re
 import shutil
-from collections.abc import Sequence, Set
+from collections.abc import Mapping, Sequence, Set
 from dataclasses import asdict, dataclass, field
 from pathlib import Path, PurePosixPath
 from typing import Any
@@ -17,6 +17,7 @@ from sgwarp.errors import InputError
 from sgwarp.files.access import reading
 from sgwarp.files.atomic import atomic_path
 from sgwarp.files.documents import read_json
+from sgwarp.files.images import read_size
 from sgwarp.io.foreign_captures import describe_unread
 from sgwarp.io.stems import is_image_name
 from sgwarp.reconstruction.sfm.features import (
@@ -32,6 +33,7 @@ from sgwarp.runs.progress import Report
 logger = logging.getLogger("sgwarp")
 MODEL = Path("sparse") / "0"
 NOTES = "sfm.json"
+NOT_COLMAP = (".webp",)
 LEAST_PHOTOGRAPHS = 3
 # Folders of what belongs to photographs, without a final s; Polycam's corrected copies show each photograph again.
 BESIDE = frozenset(("mask", "depth", "label", "semantic", "normal", "confidence", "segmentation", "corrected_image"))
@@ -122,7 +124,11 @@ def estimate_poses(
         database.unlink(missing_ok=True)
         _write_notes(out, {"fingerprint": own})
     pycolmap.set_random_seed(settings.seed)
-    readable = [name for name in names if _readable(folder / name)]
+    unreadable = {name: reason for name in names if (reason := _why_unreadable(folder / name))}
+    readable = [name for name in names if name not in unreadable]
+    if unreadable and len(readable) < LEAST_PHOTOGRAPHS:
+        name, reason = next(iter(unreadable.items()))
+        raise InputError(f"{folder / name}: {reason} ({len(unreadable)} of {len(names)} photographs)")
     extract_features(database, folder, readable, settings, report)
     match_features(database, choose_pairs(readable, settings.matching), settings, report)
     model = _map(database, folder, out, settings, len(readable), report)
@@ -132,21 +138,22 @@ def estimate_poses(
         model.num_points3D(),
         float(model.compute_mean_reprojection_error()),
     )
-    found.left_out.update(_reasons(database, names, readable, found.registered))
+    found.left_out.update(_reasons(database, unreadable, readable, found.registered))
     _keep(model, folder, out)
     _write_notes(out, {"fingerprint": own, **asdict(found)})
     database.unlink(missing_ok=True)
     return found
 
 
-def _readable(path: Path) -> bool:
-    from sgwarp.files.images import read_size
-
+def _why_unreadable(path: Path) -> str | None:
+    """Why COLMAP cannot read a photograph, or None if it can."""
+    if path.suffix.lower() in NOT_COLMAP:
+        return f"needs another format: COLMAP reads no {path.suffix.lower()[1:]}, convert it to JPEG or PNG"
     try:
         read_size(path)
     except InputError:
-        return False
-    return True
+        return "cannot be read"
+    return None
 
 
 def _map(database: Path, folder: Path, out: Path, settings: SfmSettings, count: int, report: Report) -> Any:
@@ -166,7 +173,7 @@ def _map(database: Path, folder: Path, out: Path, settings: SfmSettings, count: 
             "and of something that is not even or shiny"
         )
     ordered = sorted(models.values(), key=lambda model: model.num_reg_images(), reverse=True)
-    if len(ordered) > 1:
+    if len(ordered) > 1 and ordered[0].num_reg_images() < count:  # parts may overlap
         others = ", ".join(str(model.num_reg_images()) for model in ordered[1:])
         logger.warning(
             "%s: falls into %d parts that could not be joined; the largest is used (%d photographs; others: %s)",
@@ -197,11 +204,11 @@ def _attempt(database: Path, folder: Path, work: Path, options: Any, count: int,
 
 
 def _reasons(
-    database: Path, names: Sequence[str], readable: Sequence[str], registered: Sequence[str]
+    database: Path, unreadable: Mapping[str, str], readable: Sequence[str], registered: Sequence[str]
 ) -> dict[str, str]:
     """Why photographs have no pose, as far as the database tells."""
     pycolmap = require_pycolmap()
-    reasons = {name: "cannot be read" for name in set(names) - set(readable)}
+    reasons = dict(unreadable)
     data = pycolmap.Database.open(database)
     images = {image.name: image.image_id for image in data.read_all_images()}
     best: dict[int, int] = {}

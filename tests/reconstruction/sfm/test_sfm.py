@@ -71,6 +71,14 @@ def test_too_few_photographs_are_refused(tmp_path, capsys):
     assert "holds 1 photographs; structure from motion needs at least 3" in capsys.readouterr().err
 
 
+def test_photographs_that_colmap_cannot_read_are_named(tmp_path):
+    for index in range(4):
+        (tmp_path / "in").mkdir(exist_ok=True)
+        cv2.imwrite(str(tmp_path / f"in/{index}.webp"), np.full((24, 32, 3), index, np.uint8))
+    with pytest.raises(InputError, match=r"0\.webp: needs another format: COLMAP reads no webp, .* \(4 of 4 photog"):
+        estimate_poses(tmp_path / "in", tmp_path / "out")
+
+
 def test_photographs_that_do_not_overlap_are_refused(tmp_path):
     for index in range(3):
         write_rgb(tmp_path / "in" / f"{index}.png", np.random.default_rng(index).random((96, 128, 3)))
