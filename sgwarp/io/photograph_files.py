@@ -61,7 +61,7 @@ class PhotographFiles:
             try:
                 own = (path for path in folder.iterdir() if is_image_name(path))
                 self._folders[folder] = [path for path in own if path.name not in self._listed]
-            except OSError:
+            except (OSError, ValueError):  # ValueError: the name holds a null byte or half a character
                 self._folders[folder] = []
         return self._folders[folder]
 

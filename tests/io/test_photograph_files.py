@@ -65,6 +65,13 @@ def test_two_files_that_may_be_meant_are_neither(tmp_path):
     assert [view.stem for view in load_views(tmp_path)] == ["b"]
 
 
+@pytest.mark.parametrize("name", ["images\0/a.png", "images/\ud800/a.png", "x" * 5000 + "/a.png", "images/a.png/b.png"])
+def test_names_that_no_file_can_have_are_left_out(tmp_path, name):
+    photograph(tmp_path / "images/a.png")
+    transforms(tmp_path, [name, "images/a.png"])
+    assert [view.name for view in load_views(tmp_path)] == ["images/a.png"]
+
+
 def test_whole_paths_into_the_data_set_are_taken(tmp_path):
     photograph(tmp_path / "images/a.png")
     transforms(tmp_path, [str(tmp_path / "images/a.png")])
