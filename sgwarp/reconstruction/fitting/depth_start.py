@@ -11,7 +11,7 @@ import numpy as np
 from sgwarp.errors import InputError
 from sgwarp.reconstruction.depth_unit import measure_depth_unit, shrink_depth
 from sgwarp.reconstruction.fitting.belongings import OfView
-from sgwarp.scene import View
+from sgwarp.scene import Camera, View
 from sgwarp.scene.extent import camera_extent
 
 logger = logging.getLogger("sgwarp")
@@ -33,12 +33,14 @@ def usable_depth(source: str, depth_of: Callable[[View], Any], views: Sequence[V
         InputError: No view has depth, or the views contradict each other on it in any unit.
     """
     failed: list[InputError] = []
-    small, cameras = [], []
+    small: list[Any] = []
+    cameras: list[Camera] = []
     for view in views:
         depth = _read(depth_of, view, failed)
         depth = np.where(np.isfinite(depth) & (depth > 0), depth, 0)
-        for parts, part in zip((small, cameras), shrink_depth(depth, view.camera), strict=True):
-            parts.append(part)
+        shrunk, camera = shrink_depth(depth, view.camera)
+        small.append(shrunk)
+        cameras.append(camera)
     if len(failed) == len(views):
         raise failed[0]
     if failed:
@@ -55,7 +57,7 @@ def _read(depth_of: Callable[[View], Any], view: View, failed: list[InputError])
         return np.zeros(view.camera.size, np.float32)
 
 
-def _factor(source: str, depths: Sequence[Any], cameras: Sequence[Any], extent: float) -> float:
+def _factor(source: str, depths: Sequence[Any], cameras: Sequence[Camera], extent: float) -> float:
     """What the depth has to be multiplied by to fit the poses."""
     found = measure_depth_unit(depths, cameras, extent)
     if found is None:

@@ -83,7 +83,7 @@ class _Search:
         def evaluate() -> Tensor:
             solver.zero_grad()
             loss = self._loss(STEP * steps)
-            loss.backward()  # type: ignore[no-untyped-call]
+            loss.backward()
             return loss
 
         solver.step(evaluate)
