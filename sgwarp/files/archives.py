@@ -27,6 +27,10 @@ def unpacked_limit(size: int) -> int:
     return LARGEST_RATIO * size + ALLOWANCE
 
 
+# What zipfile and zlib object to; a member that asks for a password is a RuntimeError.
+DAMAGES = (zipfile.BadZipFile, zlib.error, EOFError, OverflowError, RuntimeError, ValueError, struct.error)
+
+
 class Archive:
     """A zip file whose members have been checked: none encrypted, sizes plausible, together within the limit.
 
@@ -150,10 +154,8 @@ def _damages(path: str | os.PathLike[str]) -> Iterator[None]:
         yield
     except InputError:
         raise
-    except (zipfile.BadZipFile, zlib.error, EOFError, NotImplementedError, OverflowError) as error:
+    except DAMAGES as error:
         raise InputError(f"{path}: is no archive, or is damaged ({_line(error)}); copy it again") from None
-    except (RuntimeError, ValueError, struct.error) as error:
-        raise InputError(f"{path}: is damaged ({_line(error)}); copy it again") from None
 
 
 def _line(error: BaseException) -> str:

@@ -6,7 +6,6 @@ import io
 import os
 import struct
 import zipfile
-import zlib
 from pathlib import Path
 from typing import IO, Any
 
@@ -15,7 +14,7 @@ from numpy.typing import NDArray
 
 from sgwarp.errors import InputError
 from sgwarp.files.access import reading
-from sgwarp.files.archives import unpacked_limit
+from sgwarp.files.archives import DAMAGES, unpacked_limit
 from sgwarp.files.arrays import LONGEST_HEADER, read_header
 
 LOCAL_HEADER = 30  # bytes of a zip member's local header before its name
@@ -88,7 +87,9 @@ class StackedArray:
             with reading(self.path):
                 stored = self._member.compress_type == zipfile.ZIP_STORED
                 data = self._stored(start, count) if stored else self._compressed(start, count)
-        except (zipfile.BadZipFile, zlib.error, EOFError) as error:
+        except InputError:
+            raise
+        except DAMAGES as error:
             raise InputError(f"{self.path}: array '{self.name}' is damaged ({error}); download it again") from None
         if len(data) != count:
             raise InputError(f"{self.path}: array '{self.name}' is cut short; copy or download it again")
@@ -139,7 +140,7 @@ def open_stacks(path: str | os.PathLike[str]) -> dict[str, StackedArray]:
             arrays = [StackedArray(path, archive, member) for member in members]
     except InputError:
         raise
-    except (zipfile.BadZipFile, zlib.error, EOFError, ValueError, NotImplementedError) as error:
+    except DAMAGES as error:
         reason = " ".join(str(error).split()) or type(error).__name__
         raise InputError(f"{path}: is not an .npz archive of arrays ({reason})") from None
     return {array.name: array for array in arrays}

@@ -116,6 +116,17 @@ def test_a_shape_that_the_archive_does_not_hold_takes_no_memory(tmp_path):
         load_sequence(huge)
 
 
+@pytest.mark.parametrize("place, value, said", [(8, 1, "password"), (10, 99, "compression")])
+def test_members_with_a_password_or_an_unknown_packing(tmp_path, place, value, said):
+    path = tmp_path / "params.npz"
+    np.savez_compressed(path, a=np.arange(60, dtype=np.float32).reshape(3, 4, 5))
+    content = bytearray(path.read_bytes())
+    content[content.index(b"PK\x01\x02") + place] = value  # in the directory at the end
+    path.write_bytes(content)
+    with pytest.raises(InputError, match=rf"params.npz: is not an .npz archive of arrays \(.*{said}"):
+        open_stacks(path)
+
+
 def test_slices_are_read_where_they_lie(tmp_path):
     """Of a stored array only the slice is read: a frame behind a damaged one is fine."""
     path = tmp_path / "a.npz"
