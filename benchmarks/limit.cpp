@@ -114,6 +114,33 @@ struct Ids {
   }
 };
 
+// The K largest weights of each pixel, place by place, 16 pixels of a row in a vector.
+struct Ranks {
+  const Splat *splats;
+  int places, used[TILE] = {};
+  Lanes *weights;  // [row][place]
+  Ints *owners;
+
+  void row(int r, Mask, Lanes weight, const Splat &s) {
+    Lanes *w = weights + r * places;
+    Ints *of = owners + r * places;
+    int place = std::min(used[r], places - 1);
+    if (!greater(weight, w[place], 0xffff)) return;
+    used[r] = place + 1;
+    const Ints mine = Ints{} + int32_t(&s - splats);
+    for (; place > 0; place--) {
+      const Ints moves = weight > w[place - 1], enters = weight > w[place];
+      w[place] = moves ? w[place - 1] : enters ? weight : w[place];
+      of[place] = moves ? of[place - 1] : enters ? mine : of[place];
+      if (!greater(weight, w[place - 1], 0xffff)) return;
+    }
+    const Ints enters = weight > w[0];
+    w[0] = enters ? weight : w[0];
+    of[0] = enters ? mine : of[0];
+  }
+  void next(int, const Splat &) {}
+};
+
 // The pairs of a tile, Gaussian by Gaussian: pixel and weight.
 struct Pairs {
   const int32_t *ids;
@@ -174,6 +201,35 @@ extern "C" void lift_ids(int n, const float *mean2d, const float *conic, const f
     Lanes T[TILE];
     Ids sink(scene, tile, image, channels, features);
     walk(scene, tile, T, sink);
+  }
+}
+
+// ids_out and weights_out [H, W, places]; -1 and 0 where there are no more.
+extern "C" void rank(int n, const float *mean2d, const float *conic, const float *opacity, int width, int height,
+                     const int32_t *offsets, const int32_t *ids, int threads, int places, int32_t *ids_out,
+                     float *weights_out) {
+  const Scene scene = {width, height, offsets, ids, splats_of(n, mean2d, conic, opacity, nullptr, threads)};
+#pragma omp parallel num_threads(threads)
+  {
+    std::vector<Lanes> weights(TILE * places);
+    std::vector<Ints> owners(TILE * places);
+#pragma omp for schedule(dynamic, 4)
+    for (int tile = 0; tile < scene.tiles(); tile++) {
+      std::fill(weights.begin(), weights.end(), Lanes{});
+      std::fill(owners.begin(), owners.end(), Ints{} - 1);
+      Lanes T[TILE];
+      Ranks sink = {scene.splats, places};
+      sink.weights = weights.data(), sink.owners = owners.data();
+      walk(scene, tile, T, sink);
+      const int left = scene.left(tile), top = scene.top(tile);
+      for (int r = 0; r < TILE && top + r < height; r++)
+        for (int c = 0; c < TILE && left + c < width; c++)
+          for (int place = 0; place < places; place++) {
+            const size_t to = ((size_t)(top + r) * width + left + c) * places + place;
+            weights_out[to] = ((const float *)&weights[r * places + place])[c];
+            ids_out[to] = ((const int32_t *)&owners[r * places + place])[c];
+          }
+    }
   }
 }
 

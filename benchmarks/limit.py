@@ -1,6 +1,6 @@
-"""The limit: compositing and lifting written by hand in C++ (limit.cpp), compiled here with g++ and called by ctypes.
+"""The limit: compositing, lifting and ranking by hand in C++ (limit.cpp), compiled here with g++, called by ctypes.
 
-All three functions take what a rasterizer has after binning, in numpy arrays:
+All functions take what a rasterizer has after binning, in numpy arrays:
     mean2d: Projected centres [pixels], float32 [M, 2].
     conic: a, b, c [1 / pixels^2], float32 [M, 3].
     opacity: float32 [M].
@@ -23,6 +23,7 @@ from pathlib import Path
 
 import numpy as np
 
+PIXELS, SUMS = ("image", "alpha", "ranks"), ("ids", "dense", "weight")  # what the self-check compares
 FOLDER = Path(__file__).parent
 FLAGS = ("-O3", "-march=native", "-ffast-math", "-fopenmp", "-shared", "-fPIC", "-std=c++17", "-w")
 
@@ -166,8 +167,42 @@ def lift_dense(
     return features, weight
 
 
+def rank(
+    mean2d: np.ndarray,
+    conic: np.ndarray,
+    opacity: np.ndarray,
+    offsets: np.ndarray,
+    ids: np.ndarray,
+    width: int,
+    height: int,
+    places: int,
+    threads: int = 1,
+    out: tuple[np.ndarray, np.ndarray] | None = None,
+) -> tuple[np.ndarray, np.ndarray]:
+    """The `places` rows of largest alpha T at each pixel, int32 [H, W, places], -1 for none, and their alpha T.
+
+    Needs AVX-512.
+    """
+    n, f, shape = len(opacity), np.float32, (height, width, places)
+    rows, weights = out or (np.empty(shape, np.int32), np.empty(shape, f))
+    library("limit").rank(
+        n,
+        pointer(mean2d, f, (n, 2)),
+        pointer(conic, f, (n, 3)),
+        pointer(opacity, f, (n,)),
+        width,
+        height,
+        *_tiles(offsets, ids, width, height),
+        threads,
+        places,
+        pointer(rows, np.int32, shape),
+        pointer(weights, f, shape),
+    )
+    return rows, weights
+
+
 def self_check(threads: int = 2) -> dict[str, float]:
-    """Compare all three with the float64 oracle on a small room whose size fills no number of tiles.
+    """Compare all with the float64 oracle on a small room whose size fills no number of tiles.
 
     Pixels within 1e-4 of a threshold are left out of the comparison of images; lifting compares sums.
 
@@ -193,6 +228,10 @@ def self_check(threads: int = 2) -> dict[str, float]:
         "image": float(np.abs(rgb - raster.features.numpy())[clear].max()),
         "alpha": float(np.abs(alpha - raster.alpha.numpy())[clear].max()),
     }
+    ranked = rank(p.mean2d, p.conic, p.opacity, p.offsets, p.ids, p.width, p.height, 128, threads)[1]
+    if ranked[..., -1].any() or (np.diff(ranked, axis=2) > 0).any():
+        raise RuntimeError("limit.cpp: the lists of contributors are cut or out of order")
+    errors["ranks"] = float(np.abs(ranked.sum(axis=2) - raster.alpha.numpy())[clear].max())
     rng = np.random.default_rng(0)
     labels = rng.integers(-1, len(LABELS), camera.size, dtype=np.int32)
     labels[:50] = 3  # one id over many tiles, besides tiles that hold all of them
@@ -208,7 +247,10 @@ def self_check(threads: int = 2) -> dict[str, float]:
         for name, got, expected in (("dense", features, lifted.features), ("weight", weight, lifted.weight)):
             expected = expected.numpy()[p.order]
             errors[name] = max(errors.get(name, 0.0), float(np.abs(got - expected).max() / expected.max()))
-    if max(errors["image"], errors["alpha"]) > 1e-4 or max(errors[k] for k in ("ids", "dense", "weight")) > 1e-3:
+    if (
+        max(errors[k] for k in ("image", "alpha", "ranks")) > 1e-4
+        or max(errors[k] for k in ("ids", "dense", "weight")) > 1e-3
+    ):
         raise RuntimeError(f"limit.cpp differs from the oracle: {errors}")
     return errors
 

@@ -24,23 +24,6 @@ TILE = wp.constant(16)  # side of a tile [pixels]
 AHEAD = wp.constant(6)  # splats between the one at work and the one that is fetched: each is a line of its own
 
 
-@wp.struct
-class Fragment:
-    """A splat seen from one tile; made while a list is walked, and never stored."""
-
-    x: float  # mean relative to the centre of the tile's first pixel [pixels]
-    y: float
-    a: float
-    b: float
-    c: float
-    level: float
-    depth: float  # [m]
-    gaussian: int
-    first_row: int  # rows of the tile that the footprint may touch
-    last_row: int
-    color: wp.vec3
-
-
 @wp.func
 def tile_rows(splat: Splat, height: int):
     """First and last tile row that the footprint touches; empty if first > last."""
@@ -90,48 +73,6 @@ def row_columns(splat: Splat, row: int, width: int, box_first: int, box_last: in
 #endif
 """)
 def prefetch(splats: wp.array[Splat], i: int): ...  # a hint for the CPU's cache
-
-
-@wp.func
-def row_range(splats: wp.array[Splat], rank: int, x: float):
-    """First and last dy of the footprint on a tile's 16 columns of pixel centres, the first of which lies x before it.
-
-    The lower border dy(dx) = (-a b dx + a c sqrt(w^2 - dx^2)) / (b^2 + c^2), w the half width, is concave: see
-    `column_range`.
-    """
-    b = splats[rank].b
-    c = splats[rank].c
-    inv_bc = splats[rank].inv_bc
-    half_width = splats[rank].half_width
-    lo = wp.max(-x, -half_width)
-    hi = wp.min(float(TILE - 1) - x, half_width)
-    summit = -half_width * b * inv_bc
-    at_bottom = wp.clamp(summit, lo, hi)
-    at_top = wp.clamp(-summit, lo, hi)
-    unit = splats[rank].a * inv_bc * inv_bc
-    w2 = half_width * half_width
-    bottom = (c * wp.sqrt(wp.max(w2 - at_bottom * at_bottom, 0.0)) - b * at_bottom) * unit
-    top = (-c * wp.sqrt(wp.max(w2 - at_top * at_top, 0.0)) - b * at_top) * unit
-    return top, bottom
-
-
-@wp.func
-def fragment_of(splats: wp.array[Splat], rank: int, x0: int, y0: int) -> Fragment:
-    """A splat relative to the tile whose first pixel is (x0, y0); fields are read one by one, as a copy costs more."""
-    fragment = Fragment()
-    fragment.x = splats[rank].mean[0] - float(x0) - 0.5
-    fragment.y = splats[rank].mean[1] - float(y0) - 0.5
-    fragment.a = splats[rank].a
-    fragment.b = splats[rank].b
-    fragment.c = splats[rank].c
-    fragment.level = splats[rank].level
-    fragment.depth = splats[rank].depth
-    fragment.gaussian = splats[rank].gaussian
-    top, bottom = row_range(splats, rank, fragment.x)
-    fragment.first_row = int(wp.ceil(wp.clamp(fragment.y + top, 0.0, float(TILE))))
-    fragment.last_row = int(wp.floor(wp.clamp(fragment.y + bottom, -1.0, float(TILE - 1))))
-    fragment.color = splats[rank].color
-    return fragment
 
 
 @wp.func

@@ -13,7 +13,7 @@ import warp as wp
 EXACT_OPTIONS = {
     "enable_backward": False,
     "fast_math": False,
-    "cpu_compiler_flags": "-march=native -ffp-contract=fast -mllvm=-inline-threshold=9000",
+    "cpu_compiler_flags": "-march=native -ffp-contract=fast -mprefer-vector-width=512 -mllvm=-inline-threshold=9000",
 }
 wp.set_module_options(EXACT_OPTIONS)
 

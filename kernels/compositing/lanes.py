@@ -9,20 +9,15 @@ from functools import cache
 
 import warp as wp
 
-from sgwarp.kernels.binning import TILE, Fragment
+from sgwarp.kernels.binning import TILE
 from sgwarp.kernels.compositing.loops import gather_batch, row_walk, write_row
 from sgwarp.kernels.gaussian import Splat
 from sgwarp.kernels.native import BATCH, Seen
 from sgwarp.kernels.projection.forward import Knobs
 from sgwarp.kernels.transmittance import (
-    HALF_ROW,
-    LANE_OFFSETS,
     LANE_OPTIONS,
     LANES,
     Lanes,
-    alpha_from_level,
-    attenuated,
-    contribution,
 )
 
 wp.set_module_options(LANE_OPTIONS)
@@ -37,37 +32,6 @@ def open_lanes(x: int, width: int) -> Lanes:
     for i in range(LANES):
         T[i] = wp.where(x + i < width, 1.0, 0.0)
     return T
-
-
-@wp.func
-def lane_alphas(f: Fragment, row: int, knobs: Knobs) -> Lanes:
-    """Opacity of the fragment at the 16 pixels of a row."""
-    dy = float(row) - f.y
-    v = f.c * dy
-    middle = f.b * dy + f.a * (HALF_ROW - f.x)
-    top = f.level - v * v
-    ramp = f.a * LANE_OFFSETS
-    alphas = Lanes(0.0)
-    for i in range(LANES):
-        u = middle + ramp[i]
-        alphas[i] = alpha_from_level(top - u * u, knobs)
-    return alphas
-
-
-@wp.func
-def lane_contributions(alphas: Lanes, T: Lanes, knobs: Knobs) -> Lanes:
-    w = Lanes(0.0)
-    for i in range(LANES):
-        w[i] = contribution(alphas[i], T[i], knobs)
-    return w
-
-
-@wp.func
-def lane_attenuated(alphas: Lanes, T: Lanes, knobs: Knobs) -> Lanes:
-    next_T = Lanes(0.0)
-    for i in range(LANES):
-        next_T[i] = attenuated(alphas[i], T[i], knobs)
-    return next_T
 
 
 @wp.func

@@ -19,9 +19,7 @@ from sgwarp.kernels.projection.forward import (
     Knobs,
 )
 
-wp.set_module_options(
-    EXACT_OPTIONS | {"cpu_compiler_flags": f"{EXACT_OPTIONS['cpu_compiler_flags']} -mprefer-vector-width=512"}
-)
+wp.set_module_options(EXACT_OPTIONS)
 
 GROUP = 16  # Gaussians of a kernel thread
 

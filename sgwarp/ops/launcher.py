@@ -16,7 +16,7 @@ import weakref
 from collections import deque
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from typing import Any
 
 import numpy as np
@@ -195,6 +195,25 @@ def launch(
             helper.result()
     if unwanted():  # some chunk may have been left out
         raise Interrupted
+
+
+_loaded: set[str] = set()  # modules that `load_together` has seen
+
+
+def load_together(kernels: Sequence[wp.Kernel]) -> None:
+    """Load the modules of these kernels on the CPU, side by side on as many threads as launches use.
+
+    What is not in the cache is compiled. The second time this costs nothing.
+    """
+    unseen = list({k.module.name: k.module for k in kernels if k.module.name not in _loaded}.values())
+    if not unseen:
+        return
+    _loaded.update(module.name for module in unseen)
+    if len(unseen) == 1 or _thread_count == 1:
+        return  # the launch does it
+    # What fails here fails again at the launch, which mends the cache or says what is wrong with it.
+    with suppress(Exception):
+        wp.force_load("cpu", modules=unseen, block_dim=1, max_workers=_thread_count)
 
 
 def launch_blocks(

@@ -68,7 +68,8 @@ def everything_that_has_kernels(monkeypatch) -> None:
     views, ids = [sg.View("a", camera), sg.View("b", camera)], torch.randint(0, 5, (48, 64), generator=g)
     dense = sg.FeatureMap("toy", dense=torch.rand(48, 64, CHANNELS, generator=g))
     by_id = sg.FeatureMap("toy", ids=ids, vectors=torch.rand(5, CHANNELS, generator=g))
-    for feature_map, mode in ((dense, "weighted"), (by_id, "weighted"), (dense, "center")):
+    wide = sg.FeatureMap("toy", dense=torch.rand(48, 64, 128, generator=g))
+    for feature_map, mode in ((dense, "weighted"), (wide, "weighted"), (by_id, "weighted"), (dense, "center")):
         sg.lift(scene, views, dict.fromkeys("ab", feature_map), mode)
     weigh_pairs(scene, camera, ids)
     sg.top_contributors(scene, camera, k=8)

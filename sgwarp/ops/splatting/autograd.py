@@ -12,6 +12,7 @@ from sgwarp.errors import InputError
 from sgwarp.ops.planar.harmonics import harmonic_colors
 from sgwarp.ops.splatting import backward, forward, tiles
 from sgwarp.ops.splatting.forward import Rendering, composite_recorded, packed_colors, require_finite_features
+from sgwarp.ops.splatting.loading import load_rendering
 from sgwarp.ops.splatting.plan import RenderPlan, plan_render
 from sgwarp.ops.splatting.room import ListRoom
 from sgwarp.ops.splatting.settings import RasterSettings
@@ -234,6 +235,14 @@ class _Rasterize(torch.autograd.Function):
         camera, settings = request.camera, request.settings
         gaussians = _gaussians(means, quats, scales, opacities, values, request)
         features = None if request.harmonics else values
+        if request.schedule != "block" and (features is None or features.shape[1] <= 3):
+            load_rendering(
+                means.device,
+                harmonics=request.harmonics,
+                depth=request.plan.depth,
+                backward=True,
+                absolute=request.receives_absgrad is not None,
+            )
         projected = tiles.project(gaussians, camera, settings)
         tiles.leave_out_non_finite(projected, features)
         order = tiles.depth_order(projected)

@@ -14,7 +14,7 @@ from sgwarp.kernels.contributors import lanes as contributors_lanes
 from sgwarp.kernels.transmittance import LaneIds
 from sgwarp.ops.launcher import get_threads, launch, launch_blocks, scratch, view
 from sgwarp.ops.splatting import tiles
-from sgwarp.ops.splatting.forward import LANE, TILE_ROWS, lane_scratch, runs_in_blocks
+from sgwarp.ops.splatting.forward import LANE, TILE_ROWS, batch_scratch, lane_scratch, runs_in_blocks
 from sgwarp.ops.splatting.settings import RasterSettings
 from sgwarp.scene import Camera, Gaussians
 
@@ -76,6 +76,7 @@ def rank(
         lane_scratch("weights", TILE_ROWS, k, device),
         view(owners.view(threads, TILE_ROWS, k, LANE), LaneIds),
         view(used.view(threads, TILE_ROWS), wp.int32),
+        *batch_scratch(device),
     ]
     launch(contributors_lanes.rank_contributors, lists.tile_count, inputs, outputs, device=device, slots=True)
     return ids, weights

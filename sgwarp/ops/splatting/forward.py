@@ -16,6 +16,7 @@ from sgwarp.kernels.native import BATCH, Seen
 from sgwarp.kernels.transmittance import Lanes
 from sgwarp.ops.launcher import fresh, get_threads, launch, launch_blocks, scratch, view, warp_device
 from sgwarp.ops.splatting import tiles
+from sgwarp.ops.splatting.loading import load_rendering
 from sgwarp.ops.splatting.plan import RenderPlan, Values, plan_render
 from sgwarp.ops.splatting.room import ListRoom
 from sgwarp.ops.splatting.settings import RasterSettings
@@ -96,6 +97,8 @@ def rasterize(
         values: Values = "colors" if features is None else "features"
         wants_depth = expected_depth or depth
         plan = plan_render(gaussians, values, channels=channels, depth=wants_depth, settings=settings, look=look)
+    if channels <= 3:
+        load_rendering(gaussians.device, harmonics=plan.values == "colors", depth=plan.depth)
     projected = tiles.project(gaussians, camera, settings)
     tiles.leave_out_non_finite(projected, features)
     order = tiles.depth_order(projected)

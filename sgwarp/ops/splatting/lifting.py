@@ -26,10 +26,10 @@ from sgwarp.ops.splatting.id_weights import localize_ids, weigh_ids
 from sgwarp.ops.splatting.lift_sums import LiftSums as LiftSums
 from sgwarp.ops.splatting.pixel_lifting import add_centers, add_strongest
 from sgwarp.ops.splatting.settings import RasterSettings
+from sgwarp.ops.splatting.wide_lifting import LEAST_SLICES, WIDE, add_slices, add_weights, list_entries
 from sgwarp.scene import Camera, FeatureMap, Gaussians
 
 MODES = ("weighted", "center", "squared", "strongest")
-WIDE = 4  # slices of 16 channels lifted in one walk over the tiles
 ROW_BYTES = 512 * 2**20  # at most this much scratch for the rows of all intersections
 SLICE_BYTES = 512 * 2**20  # at most this much for slices that have to be brought to the size of the image
 
@@ -133,13 +133,18 @@ def _add_dense(
     device = sums.weight.device
     valid = _valid_pixels(feature_map, camera, device)
     total_slices = sums.slices.shape[1]
+    if not _ready(feature_map, camera, device):  # a slice and its copy in the order of the kernel
+        per_pass = SLICE_BYTES // (2 * 64 * camera.height * camera.width)
+    else:
+        per_pass = total_slices
+    first = 0
+    if not way.block and total_slices >= LEAST_SLICES and per_pass >= WIDE and lists.intersections:
+        first = _add_wide(lists, camera, feature_map, valid, per_pass, sums, settings, way)
     # A pass of four slices shares one walk over the tiles; with very many intersections its rows must stay small.
     affordable = max(1, ROW_BYTES // max(1, 64 * lists.intersections))
     if way.block and not way.ordered:
         affordable = total_slices  # writes no rows
-    if not _ready(feature_map, camera, device):  # a slice and its copy in the order of the kernel
-        affordable = min(affordable, SLICE_BYTES // (2 * 64 * camera.height * camera.width))
-    first = 0
+    affordable = min(affordable, per_pass)
     while first < total_slices:
         count = WIDE if total_slices - first >= WIDE and affordable >= WIDE else 1
         if way.block:
@@ -148,6 +153,36 @@ def _add_dense(
         place = (first_feature, first, count)
         _add_dense_pass(lists, camera, features, valid, place, sums, settings, way)
         first += count
+
+
+def _add_wide(
+    lists: tiles.TileLists,
+    camera: Camera,
+    feature_map: FeatureMap,
+    valid: Tensor,
+    per_pass: int,
+    sums: LiftSums,
+    settings: RasterSettings,
+    way: _Way,
+) -> int:
+    """Lift whole groups of slices by the entries of A, at most `per_pass` slices at once; returns how many it did."""
+    entries = list_entries(lists, _valid_lanes(valid), settings, camera.size, way.squared)
+    if entries is None:
+        return 0
+    add_weights(lists, entries, sums)
+    first, total_slices = 0, sums.slices.shape[1]
+    while (count := min(per_pass, total_slices - first) // WIDE * WIDE) > 0:
+        features, first_feature = _slices_at_image_size(feature_map, camera, first, count, sums.weight.device)
+        add_slices(lists, entries, features, (first_feature, first, count), camera, sums)
+        first += count
+    return first
+
+
+def _valid_lanes(valid: Tensor) -> wp.array:
+    """A mask [H, W] as the lane schedule reads it: [H, tile columns, 1] vectors, zero beyond the image."""
+    height, width = valid.shape
+    columns = -(-width // LANE)
+    return view(torch.nn.functional.pad(valid, (0, columns * LANE - width)).view(height, columns, 1, LANE), Lanes)
 
 
 def _add_dense_pass(
@@ -182,13 +217,11 @@ def _add_dense_pass(
                 _fold(of_fragments, sums)
             return
     else:
-        columns = -(-width // LANE)
-        lanes = torch.nn.functional.pad(valid, (0, columns * LANE - width)).view(height, columns, 1, LANE)
         state = lane_scratch("state", TILE_ROWS, 1, device)
         inputs = [
             *lists.arrays(),
             view(features, Lanes),
-            view(lanes, Lanes),
+            _valid_lanes(valid),
             first_feature,
             knobs,
             width,

@@ -1,12 +1,14 @@
 """Lifting against the float64 oracle, as the transpose of the renderer, and ids against dense features."""
 
+from dataclasses import replace
+
 import pytest
 import torch
 
 from sgwarp.errors import InputError
 from sgwarp.ops import launcher
 from sgwarp.ops.reference import lifting as reference_lift
-from sgwarp.ops.splatting import tiles
+from sgwarp.ops.splatting import tiles, wide_lifting
 from sgwarp.ops.splatting.forward import rasterize
 from sgwarp.ops.splatting.lifting import LiftSums, add_weighted, lift_view
 from sgwarp.ops.splatting.settings import RasterSettings
@@ -62,6 +64,54 @@ def test_weighted_lifting_matches_the_oracle(make_scene, channels):
         torch.testing.assert_close(got.features.double(), expected.features, rtol=1e-4, atol=2e-5 * scale)
         torch.testing.assert_close(got.weight.double(), expected.weight, rtol=1e-4, atol=2e-5 * scale)
         torch.testing.assert_close(got.weight_squared, got.weight**2)
+
+
+def wide_maps(camera: Camera) -> list[FeatureMap]:
+    """129 and 208 channels: two and three groups of four slices, with one slice left over; plain, masked and small."""
+    valid = torch.rand(camera.size, generator=torch.Generator().manual_seed(2)) > 0.3
+    small = random_map(camera.resized(*(-(-side // 2) for side in camera.size)), 129)
+    wide = random_map(camera, 208)
+    return [FeatureMap("t", dense=wide), FeatureMap("t", dense=wide, valid=valid), FeatureMap("t", dense=small)]
+
+
+@pytest.mark.parametrize("squared", [False, True])
+def test_many_channels_have_the_bits_of_few(make_scene, monkeypatch, squared):
+    """Written down or walked for, the entries of A give the same sums; so do any threads and ranges of ranks."""
+    mode = "squared" if squared else "weighted"
+    _, gaussians, camera = make_scene("odd_size")
+    for feature_map in wide_maps(camera):
+        with monkeypatch.context() as patch:
+            patch.setattr(wide_lifting, "PAIR_BYTES", 0)  # never written down
+            walked = lifted(gaussians, camera, feature_map, mode=mode)
+        assert walked.weight.any()
+        for threads, ranks in ((1, 2**18), (2, 7), (5, 2**18)):
+            monkeypatch.setattr(launcher, "SMALL", 1)
+            monkeypatch.setattr(wide_lifting, "MOST_RANKS", ranks)
+            before = launcher.get_threads()
+            try:
+                launcher.set_threads(threads)
+                written = lifted(gaussians, camera, feature_map, mode=mode)
+            finally:
+                launcher.set_threads(before)
+            for name in ("slices", "weight", "weight_squared"):
+                assert torch.equal(getattr(written, name), getattr(walked, name)), (threads, name)
+
+
+def test_many_channels_match_the_oracle(make_scene):
+    for name in ("random_cloud", "needles"):
+        _, gaussians, camera = make_scene(name)
+        plain, masked, _ = wide_maps(camera)
+        got = lifted(gaussians, camera, masked)
+        expected = reference_lift.lift_weighted(gaussians, camera, plain.dense.double(), valid=masked.valid)
+        scale = expected.weight.max().item()
+        torch.testing.assert_close(got.features.double(), expected.features, rtol=1e-4, atol=2e-5 * scale)
+        torch.testing.assert_close(got.weight.double(), expected.weight, rtol=1e-4, atol=2e-5 * scale)
+
+
+def test_many_channels_of_nothing(make_scene):
+    _, gaussians, camera = make_scene("odd_size")
+    far = replace(camera, near=1e6, far=2e6)
+    assert not lifted(gaussians, far, wide_maps(far)[0]).slices.any()
 
 
 def test_ids_equal_the_dense_map_they_stand_for(scene):

@@ -1,0 +1,38 @@
+"""Loading the kernels of a rendering side by side, before the first of them is asked for."""
+
+from __future__ import annotations
+
+import torch
+import warp as wp
+
+from sgwarp.kernels import binning
+from sgwarp.kernels.compositing.lanes import make_composite_colors
+from sgwarp.kernels.compositing.lanes_backward import make_composite_backward
+from sgwarp.kernels.harmonics.backward import harmonics_backward
+from sgwarp.kernels.harmonics.forward import evaluate_harmonics
+from sgwarp.kernels.projection import lanes as projection_lanes
+from sgwarp.kernels.projection.backward import sum_intersections
+from sgwarp.ops.launcher import load_together
+
+
+def load_rendering(
+    device: torch.device, *, harmonics: bool, depth: bool, backward: bool = False, absolute: bool = False
+) -> None:
+    """Load what compositing three channels on the CPU needs; with an empty cache, compile it on all threads.
+
+    Args:
+        device: Where the scene lies; on CUDA kernels are loaded one by one.
+        harmonics: The channels are colours of harmonics.
+        depth: Depths are composited as well.
+        backward: A backward pass follows.
+        absolute: And it adds up magnitudes.
+    """
+    if device.type != "cpu":
+        return
+    # The longest first, and one of each set of compiler options: modules that share them share compiled headers.
+    # Both kernels of the projection are in one module.
+    colors = make_composite_colors(depth, backward)
+    needed: list[wp.Kernel] = [make_composite_backward(False, depth, absolute) if backward else colors]
+    needed += [projection_lanes.project_groups, colors] + [evaluate_harmonics] * harmonics + [binning.count_tiles]
+    needed += [sum_intersections] * backward + [harmonics_backward] * (harmonics and backward)
+    load_together(needed)
