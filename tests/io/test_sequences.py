@@ -116,7 +116,7 @@ def test_a_shape_that_the_archive_does_not_hold_takes_no_memory(tmp_path):
         load_sequence(huge)
 
 
-@pytest.mark.parametrize("place, value, said", [(8, 1, "password"), (10, 99, "compression")])
+@pytest.mark.parametrize(("place", "value", "said"), [(8, 1, "password"), (10, 99, "compression")])
 def test_members_with_a_password_or_an_unknown_packing(tmp_path, place, value, said):
     path = tmp_path / "params.npz"
     np.savez_compressed(path, a=np.arange(60, dtype=np.float32).reshape(3, 4, 5))

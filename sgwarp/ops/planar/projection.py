@@ -133,7 +133,7 @@ def unpack_symmetric(upper: Tensor) -> Tensor:
 
 def project_splats(
     means: Tensor,
-    viewmat: Tensor,
+    world_to_camera: Tensor,
     K: Tensor,
     width: int,
     height: int,
@@ -150,11 +150,11 @@ def project_splats(
 
     Left out are Gaussians that are not finite, have no rotation (|q|^2 < 1e-6), lie outside (near, far), are fainter
     than `alpha_min`, have a singular projection, or whose bounding box misses the image; none of them gets a gradient.
-    Differentiable in `means`, `quats`, `scales`, `covars` and `viewmat`.
+    Differentiable in `means`, `quats`, `scales`, `covars` and `world_to_camera`.
 
     Args:
         means: Centres [m], [N, 3].
-        viewmat: World to camera, [4, 4].
+        world_to_camera: Pose, [4, 4].
         K: Intrinsics [pixels], [3, 3].
         quats, scales: Rotations (w, x, y, z), [N, 4], and standard deviations [m], [N, 3]; or:
         covars: Covariances [m^2], [N, 3, 3]; then `quats` and `scales` are not read.
@@ -163,14 +163,14 @@ def project_splats(
         kernels: Let kernels do it where they can: pinhole cameras, quaternions and scales, float32. By default on CUDA.
     """
     if means.is_cuda if kernels is None else kernels:
-        made = _by_kernels(means, viewmat, K, width, height, settings, quats, scales, covars, opacities, sparse)
+        made = _by_kernels(means, world_to_camera, K, width, height, settings, quats, scales, covars, opacities, sparse)
         if made is not None:
             return made
     shapes = [covars] if covars is not None else [quats, scales]
     given = [t for t in (means, *shapes, opacities) if t is not None]
-    index = _candidates(given, quats if covars is None else None, opacities, viewmat, settings)
+    index = _candidates(given, quats if covars is None else None, opacities, world_to_camera, settings)
     # From here components come first, [3, V]: rows of V numbers are what element-wise work is fast on.
-    pose = viewmat.to(means.device, torch.float64)
+    pose = world_to_camera.to(means.device, torch.float64)
     columns = select_rows(means, index, sparse).T
     # In float64 until the origin is the camera's, so that scenes far from theirs keep their digits.
     points = (pose[:3, :3] @ columns.to(torch.float64) + pose[:3, 3:]).to(means.dtype)
@@ -194,7 +194,7 @@ def project_splats(
 
 def _by_kernels(
     means: Tensor,
-    viewmat: Tensor,
+    world_to_camera: Tensor,
     K: Tensor,
     width: int,
     height: int,
@@ -218,7 +218,7 @@ def _by_kernels(
         return None
     from sgwarp.ops.planar.tables import ProjectTable, TableRequest, read_camera
 
-    camera = read_camera(viewmat, K, width, height, settings.near, settings.far)
+    camera = read_camera(world_to_camera, K, width, height, settings.near, settings.far)
     if camera is None:
         return None
     opacity = means.new_empty(0) if opacities is None else opacities.detach().contiguous()
@@ -226,21 +226,25 @@ def _by_kernels(
     assert quats is not None
     assert scales is not None
     index, means2d, depths, conics, factors, compensations, covariances, radii = ProjectTable.apply(
-        means.contiguous(), quats.contiguous(), scales.contiguous(), viewmat, request
+        means.contiguous(), quats.contiguous(), scales.contiguous(), world_to_camera, request
     )
     kept = compensations if settings.compensated else None
     return ProjectedSplats(index, means2d, depths, conics, factors, kept, covariances, radii, camera)
 
 
 def _candidates(
-    given: list[Tensor], quats: Tensor | None, opacities: Tensor | None, viewmat: Tensor, settings: ProjectionSettings
+    given: list[Tensor],
+    quats: Tensor | None,
+    opacities: Tensor | None,
+    world_to_camera: Tensor,
+    settings: ProjectionSettings,
 ) -> Tensor:
     """Rows that are finite, in range and not transparent, int64; cheap tests before anything is projected."""
     with torch.no_grad():
         # One sum is finite only if all of its terms are.
         flat = [t.reshape(len(t), math.prod(t.shape[1:])) for t in given]
         total = torch.stack([t @ t.new_ones(t.shape[1]) for t in flat]).sum(0)
-        pose = viewmat.to(given[0].device, torch.float64)
+        pose = world_to_camera.to(given[0].device, torch.float64)
         depth = given[0].to(torch.float64) @ pose[2, :3] + pose[2, 3]
         keep = torch.isfinite(total) & (depth > settings.near) & (depth < settings.far)
         if settings.camera_model != "ortho":

@@ -48,9 +48,9 @@ class TableRequest:
         return RasterSettings(alpha_min=s.alpha_min, dilation=s.dilation, antialiased=s.compensated)
 
 
-def read_camera(viewmat: Tensor, K: Tensor, width: int, height: int, near: float, far: float) -> Camera | None:
+def read_camera(world_to_camera: Tensor, K: Tensor, width: int, height: int, near: float, far: float) -> Camera | None:
     """The camera on the host, for which it waits once; None if it is none that the kernels know."""
-    pose, intrinsics = (t.detach().to(torch.float64).flatten() for t in (viewmat, K))
+    pose, intrinsics = (t.detach().to(torch.float64).flatten() for t in (world_to_camera, K))
     if pose.device == intrinsics.device:
         pose, intrinsics = torch.cat([pose, intrinsics]).cpu().split([16, 9])
     try:
@@ -60,12 +60,12 @@ def read_camera(viewmat: Tensor, K: Tensor, width: int, height: int, near: float
 
 
 class ProjectTable(torch.autograd.Function):
-    """(means, quats, scales, viewmat, request) -> index, means2d, depths, conics, factors, compensations, covariances,
-    radii of the Gaussians that are kept; see `projection.ProjectedSplats`."""
+    """(means, quats, scales, world_to_camera, request) -> index, means2d, depths, conics, factors, compensations,
+    covariances, radii of the Gaussians that are kept; see `projection.ProjectedSplats`."""
 
     @staticmethod
     def forward(
-        ctx: Any, means: Tensor, quats: Tensor, scales: Tensor, viewmat: Tensor, request: TableRequest
+        ctx: Any, means: Tensor, quats: Tensor, scales: Tensor, world_to_camera: Tensor, request: TableRequest
     ) -> tuple[Tensor, ...]:
         count, device = len(means), means.device
         kept = torch.empty(count, dtype=torch.uint8, device=device)
@@ -79,7 +79,7 @@ class ProjectTable(torch.autograd.Function):
         index = kept.nonzero()[:, 0]
         rows = table.index_select(0, index)
         radii = radii.index_select(0, index)
-        ctx.save_for_backward(means, quats, scales, viewmat, index, rows)
+        ctx.save_for_backward(means, quats, scales, world_to_camera, index, rows)
         ctx.request = request
         ctx.set_materialize_grads(False)
         means2d, depths, conics, factors, compensations, covariances = rows.split([2, 1, 3, 3, 1, 3], dim=1)
@@ -91,7 +91,7 @@ class ProjectTable(torch.autograd.Function):
     @staticmethod
     @torch.autograd.function.once_differentiable
     def backward(ctx: Any, _index: None, *given: Tensor | None) -> tuple[Tensor | None, ...]:
-        means, quats, scales, viewmat, index, rows = ctx.saved_tensors
+        means, quats, scales, world_to_camera, index, rows = ctx.saved_tensors
         request: TableRequest = ctx.request
         sums = torch.zeros(len(means), LANE, device=means.device)
         inputs = [view(index, wp.int64), view(rows, wp.float32)]
@@ -107,7 +107,9 @@ class ProjectTable(torch.autograd.Function):
         splats = SplatGradients(sums, kernels.AT_DEPTH, sums[:, :0], None)
         pose = ctx.needs_input_grad[3]
         result = backward.project_backward(gaussians, request.camera, request.raster_settings, splats, pose=pose)
-        v_viewmat = backward.pose_gradient(request.camera, result.poses, None).to(viewmat) if pose else None
+        v_world_to_camera = (
+            backward.pose_gradient(request.camera, result.poses, None).to(world_to_camera) if pose else None
+        )
         gradients: tuple[Tensor, ...] = (result.means, result.quats, result.scales)
         if request.sparse:
             gradients = tuple(
@@ -116,7 +118,7 @@ class ProjectTable(torch.autograd.Function):
                 )
                 for g in gradients
             )
-        return *gradients, v_viewmat, None
+        return *gradients, v_world_to_camera, None
 
 
 class ShadeTable(torch.autograd.Function):

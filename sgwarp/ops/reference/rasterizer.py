@@ -144,7 +144,7 @@ def project(
     quats: Tensor,
     scales: Tensor,
     opacities: Tensor,
-    viewmat: Tensor,
+    world_to_camera: Tensor,
     K: Tensor,
     width: int,
     height: int,
@@ -159,14 +159,14 @@ def project(
         quats: Rotations (w, x, y, z), [N, 4].
         scales: Standard deviations [m], [N, 3].
         opacities: [N].
-        viewmat: World to camera, [4, 4].
+        world_to_camera: Pose, [4, 4].
         K: Intrinsics [pixels], [3, 3].
 
     Left out are rows that are not finite, not within (near, far), have |q|^2 < 1e-6 or an opacity below alpha_min, a
     singular projected covariance, or a bounding box of {alpha >= alpha_min} that does not touch the image.
     """
     settings = settings or ReferenceSettings()
-    R, t = viewmat[:3, :3], viewmat[:3, 3]
+    R, t = world_to_camera[:3, :3], world_to_camera[:3, 3]
     with torch.no_grad():
         fields = torch.cat([means, quats, scales, opacities[:, None]], dim=1)
         z = means @ R[2] + t[2]
@@ -222,17 +222,17 @@ def harmonics(directions: Tensor, degree: int) -> Tensor:
     return torch.stack(basis, dim=1)
 
 
-def spherical_harmonics(means: Tensor, sh: Tensor, viewmat: Tensor, degree: int | None = None) -> Tensor:
+def spherical_harmonics(means: Tensor, sh: Tensor, world_to_camera: Tensor, degree: int | None = None) -> Tensor:
     """Colours [N, 3] of Gaussians seen by the camera: max(0, sum of sh times basis + 0.5).
 
     Args:
         means: Centres [m], [N, 3].
         sh: Coefficients, [N, K, 3].
-        viewmat: World to camera, [4, 4].
+        world_to_camera: Pose, [4, 4].
         degree: Highest degree used, all of `sh` by default.
     """
     degree = math.isqrt(sh.shape[1]) - 1 if degree is None else degree
-    position = -viewmat[:3, :3].T @ viewmat[:3, 3]
+    position = -world_to_camera[:3, :3].T @ world_to_camera[:3, 3]
     directions = torch.nn.functional.normalize(means - position, dim=1)
     basis = harmonics(directions, degree)
     return ((basis[:, :, None] * sh[:, : basis.shape[1]]).sum(dim=1) + 0.5).clamp(min=0.0)

@@ -56,8 +56,8 @@ def rasterize(
         quats: Rotations (w, x, y, z) of any length, float [N, 4].
         scales: Standard deviations [m], float [N, 3].
         opacities: In [0, 1], float [N].
-        viewmat: World to camera, OpenCV axes, rigid, float [4, 4]. Its gradient is that of the 12 free entries of
-            p = R m + t; project it onto rigid motions by parametrising them.
+        viewmat: World to camera (gsplat's name), OpenCV axes, rigid, float [4, 4]. Its gradient is that of the 12 free
+            entries of p = R m + t; project it onto rigid motions by parametrising them.
         K: Intrinsics [pixels], [3, 3].
         width: Image width [pixels].
         height: Image height [pixels].
@@ -168,9 +168,9 @@ def rasterize(
     return Rendering(image, alpha, mean_depth, surface if depth else None, request.status_counts)
 
 
-def _colors(means: Tensor, sh: Tensor, viewmat: Tensor) -> tuple[Tensor, Tensor]:
+def _colors(means: Tensor, sh: Tensor, world_to_camera: Tensor) -> tuple[Tensor, Tensor]:
     """Colors of the harmonics seen from the camera, [N, 3], and which Gaussians have one, bool [N]."""
-    pose = viewmat.to(means)
+    pose = world_to_camera.to(means)
     directions = means + pose[:3, 3] @ pose[:3, :3]  # the camera lies at -R^T t
     return harmonic_colors(directions, sh.to(means), SH_COUNTS.index(sh.shape[1]))
 
@@ -228,7 +228,7 @@ class _Rasterize(torch.autograd.Function):
         scales: Tensor,
         opacities: Tensor,
         values: Tensor,
-        viewmat: Tensor,
+        world_to_camera: Tensor,
         means2d: Tensor | None,
         request: _Request,
     ) -> tuple[Tensor, Tensor, Tensor, Tensor]:
@@ -253,7 +253,9 @@ class _Rasterize(torch.autograd.Function):
         )
         request.status_counts = projected.counts()
         recorded = (transmittance, last, hit)
-        ctx.save_for_backward(means, quats, scales, opacities, values, viewmat, *recorded, *vars(lists).values())
+        ctx.save_for_backward(
+            means, quats, scales, opacities, values, world_to_camera, *recorded, *vars(lists).values()
+        )
         ctx.request = request
         ctx.channels = image.shape[2]
         ctx.set_materialize_grads(False)
@@ -270,7 +272,7 @@ class _Rasterize(torch.autograd.Function):
     ) -> tuple[Tensor | None, ...]:
         request: _Request = ctx.request
         camera, settings = request.camera, request.settings
-        means, quats, scales, opacities, values, viewmat, *kept = ctx.saved_tensors
+        means, quats, scales, opacities, values, world_to_camera, *kept = ctx.saved_tensors
         gaussians = _gaussians(means, quats, scales, opacities, values, request)
         recorded, lists = (kept[0], kept[1], kept[2]), tiles.TileLists(*kept[3:])
         splats = backward.composite_backward(
@@ -292,7 +294,9 @@ class _Rasterize(torch.autograd.Function):
         if request.harmonics:
             degree = request.plan.sh_degree
             v_values, v_offsets = backward.shade_backward(gaussians, camera, splats, result.means, degree, pose=pose)
-        v_viewmat = backward.pose_gradient(camera, result.poses, v_offsets).to(viewmat) if pose else None
+        v_world_to_camera = (
+            backward.pose_gradient(camera, result.poses, v_offsets).to(world_to_camera) if pose else None
+        )
         if request.receives_absgrad is not None:
             _accumulate(request.receives_absgrad, splats.absolute)
         return (
@@ -301,7 +305,7 @@ class _Rasterize(torch.autograd.Function):
             result.scales,
             result.opacities,
             v_values,
-            v_viewmat,
+            v_world_to_camera,
             result.means2d if ctx.needs_input_grad[6] else None,
             None,
         )

@@ -75,9 +75,9 @@ def test_gradients(model, given):
     shape = (quats, scales) if given == "quats" else (axes @ axes.transpose(1, 2),)
     settings = ProjectionSettings(model, compensated=True)
 
-    def run(means, viewmat, *shape):
+    def run(means, world_to_camera, *shape):
         named = dict(zip(("quats", "scales"), shape, strict=True)) if given == "quats" else {"covars": shape[0]}
-        p = project_splats(means, viewmat, intrinsics(model), *SIZE, settings, **named)
+        p = project_splats(means, world_to_camera, intrinsics(model), *SIZE, settings, **named)
         return p.means2d, p.depths, p.conics, p.factors, p.compensations
 
     inputs = [t.clone().requires_grad_() for t in (means, torch.eye(4, dtype=torch.float64), *shape)]

@@ -68,8 +68,8 @@ def test_tables_of_kernels_are_those_of_torch(scene, compensated):
         elif name == "conics" and scene.name == "needles":  # whose moments would be differences of large terms
             weights[name] = torch.zeros_like(noise)
     pairs = zip(gradients(mine, here, index, weights), gradients(exact, there, index, weights), strict=True)
-    for name, (got, want) in zip(("means", "quats", "scales", "viewmat"), pairs, strict=True):
-        if name == "viewmat":
+    for name, (got, want) in zip(("means", "quats", "scales", "world_to_camera"), pairs, strict=True):
+        if name == "world_to_camera":
             got, want = got[None, :3], want[None, :3]
         error, size = ((t.double()).flatten(1).norm(dim=1) for t in (got - want, want))
         bound = 1e-3 * size.clamp(min=0.1 * size[size > 0].median())

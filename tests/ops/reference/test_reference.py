@@ -275,11 +275,11 @@ def test_gradients_match_finite_differences(antialiased):
     background = torch.tensor([0.3, 0.6, 0.1], dtype=torch.float64)
     inputs = [means, quats, scales, opacities, sh, cam.world_to_camera.clone(), background]
 
-    def render(means, quats, scales, opacities, sh, viewmat, background):
+    def render(means, quats, scales, opacities, sh, world_to_camera, background):
         projection = reference.project(
-            means, quats, scales, opacities, viewmat, cam.K, cam.width, cam.height, settings=settings
+            means, quats, scales, opacities, world_to_camera, cam.K, cam.width, cam.height, settings=settings
         )
-        colors = reference.spherical_harmonics(means, sh, viewmat)
+        colors = reference.spherical_harmonics(means, sh, world_to_camera)
         raster = reference.composite(projection, colors, cam.width, cam.height, background, settings)
         return raster.features, raster.alpha, raster.expected_depth
 

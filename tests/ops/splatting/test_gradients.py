@@ -39,11 +39,11 @@ class Leaves:
     ) -> "Leaves":
         named = {name: getattr(gaussians, name) for name in GEOMETRY}
         named |= {"sh": gaussians.sh} if features is None else {"features": features}
-        named |= {"background": background, "viewmat": camera.world_to_camera}
+        named |= {"background": background, "world_to_camera": camera.world_to_camera}
         named["means2d"] = torch.zeros(len(gaussians), 2)
         leaves = cls({name: tensor.detach().to(dtype).clone().requires_grad_() for name, tensor in named.items()})
         # The pose is float64 on both sides: at 1e5 m its float32 is another camera.
-        leaves.tensors["viewmat"] = camera.world_to_camera.clone().requires_grad_()
+        leaves.tensors["world_to_camera"] = camera.world_to_camera.clone().requires_grad_()
         return leaves
 
     def gradients(self) -> dict[str, Tensor]:
@@ -86,7 +86,7 @@ def oracle(leaves: Leaves, camera: Camera, settings: RasterSettings) -> referenc
     t = leaves.tensors
     projection = reference.project(
         *(t[name] for name in GEOMETRY),
-        t["viewmat"],
+        t["world_to_camera"],
         camera.K,
         camera.width,
         camera.height,
@@ -97,7 +97,7 @@ def oracle(leaves: Leaves, camera: Camera, settings: RasterSettings) -> referenc
     projection.mean2d.add_(t["means2d"][projection.index])
     features = t.get("features")
     if features is None:
-        features = reference.spherical_harmonics(t["means"], t["sh"], t["viewmat"], settings.sh_degree)
+        features = reference.spherical_harmonics(t["means"], t["sh"], t["world_to_camera"], settings.sh_degree)
     return reference.composite(projection, features, camera.width, camera.height, t["background"], mirrored(settings))
 
 
@@ -105,7 +105,7 @@ def ours(leaves: Leaves, camera: Camera, settings: RasterSettings, *, depths: bo
     t = leaves.tensors
     return rasterize_differentiable(
         *(t[name] for name in GEOMETRY),
-        t["viewmat"],
+        t["world_to_camera"],
         camera.K,
         camera.width,
         camera.height,
@@ -144,7 +144,7 @@ def both(
 
 def assert_rows_close(got: dict[str, Tensor], expected: dict[str, Tensor], tolerance: float = RELATIVE_TOLERANCE):
     for name, exact in expected.items():
-        rows = 1 if name in ("viewmat", "background") else len(exact)
+        rows = 1 if name in ("world_to_camera", "background") else len(exact)
         want = exact.double().reshape(rows, -1)
         error = (got[name].double().reshape(rows, -1) - want).norm(dim=1)
         size = want.norm(dim=1)
@@ -204,7 +204,7 @@ def compare_with_differences(compare, gaussians: Gaussians, camera: Camera, sett
     point = {name: tensor.detach() for name, tensor in point.items()}
     depths = point["means"] @ camera.world_to_camera[2, :3] + camera.world_to_camera[2, 3]
     if len(depths.unique()) < len(depths):
-        del got["means"], got["viewmat"]  # what breaks a tie in depth makes the image jump
+        del got["means"], got["world_to_camera"]  # what breaks a tie in depth makes the image jump
     compare(lambda moved: loss(oracle(Leaves(moved), camera, settings)), point, got, groups)
 
 
@@ -320,7 +320,7 @@ def test_left_out_gaussians_have_gradients_of_exactly_zero(make_scene):
     loss(ours(leaves, camera, settings)).backward()
     for name, gradient in leaves.gradients().items():
         reference_gradient = clean.tensors[name].grad
-        if name in ("background", "viewmat"):
+        if name in ("background", "world_to_camera"):
             torch.testing.assert_close(gradient, reference_gradient, rtol=1e-9, atol=0)
         else:
             assert (gradient[:9] == 0).all(), name
@@ -387,7 +387,7 @@ def test_empty_scene_has_empty_gradients(make_scene):
         pixels = torch.full_like(background, camera.width * camera.height)
         torch.testing.assert_close(leaves.tensors["background"].grad, pixels)
         assert leaves.tensors["means"].grad.shape == (0, 3)
-        assert (leaves.tensors["viewmat"].grad == 0).all()
+        assert (leaves.tensors["world_to_camera"].grad == 0).all()
 
 
 def test_inputs_are_checked(make_scene):
