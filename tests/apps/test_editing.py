@@ -9,7 +9,7 @@ import torch
 
 from sgwarp.apps.editing import operations as ops
 from sgwarp.apps.editing.measurement import measure_edit
-from sgwarp.apps.editing.picker import EditContext, _name_instances, grow, largest_pieces, pick
+from sgwarp.apps.editing.picker import EditContext, _name_instances, grow, largest_pieces, pick, pieces
 from sgwarp.apps.editing.script import EditStep, load_script, save_script, step_from
 from sgwarp.apps.editing.selection import Selection, parse_term
 from sgwarp.apps.editing.session import HISTORY, EditSession, edit
@@ -405,6 +405,15 @@ def test_scattered_pieces_are_left_out(stage):
     assert torch.equal(largest_pieces(stage.gaussians.means, dirty), lamp)
     both = (stage.classes == 3) | (stage.classes == 4)
     assert torch.equal(largest_pieces(stage.gaussians.means, both), both), "two large pieces both stay"
+
+
+@pytest.mark.parametrize("count", [2, 3, 40])
+def test_pieces_of_few_gaussians(count):
+    """Evenly spaced on a line they are one piece; the last, far away and not chosen, is in none."""
+    means = torch.zeros(count + 1, 3)
+    means[:, 0] = torch.arange(count + 1)
+    chosen = torch.arange(count + 1) < count
+    assert pieces(means, chosen).tolist() == [0] * count + [-1]
 
 
 @pytest.mark.parametrize(

@@ -12,12 +12,15 @@ from sgwarp.apps.editing import operations as ops
 from sgwarp.apps.editing.script import EditStep
 from sgwarp.apps.editing.selection import Selection
 from sgwarp.cli import main
+from sgwarp.commands.instances import Instances
 from sgwarp.errors import InputError
 from sgwarp.files.images import read_ids
 from sgwarp.io.instances import load_instances, save_instances
 from sgwarp.io.scenes import load_gaussians, save_gaussians
 from sgwarp.io.store import save_semantics
 from sgwarp.lifting.lifter import lift
+from sgwarp.runs.log import RunLog
+from sgwarp.runs.progress import hide_progress
 
 
 def succeeds(*arguments) -> None:
@@ -63,6 +66,22 @@ def test_instances_writes_what_it_found(stage, stage_files, found):
         name = np.bincount(ids[truth == number]).argmax()
         assert name > 0
         assert ((ids == name) & (truth == number)).sum() > 0.85 * ((ids == name) | (truth == number)).sum()
+
+
+def test_progress_says_that_it_renders(stage, stage_files, found, tmp_path, monkeypatch):
+    titles = []
+
+    def show(title):
+        titles.append(title)
+        return hide_progress(title)
+
+    monkeypatch.setattr("sgwarp.commands.instances.show_progress", show)
+    where = {"scene": stage_files.scene, "views": stage_files.views, "out": tmp_path / "i.safetensors"}
+    command, log = Instances(**where, masks="", render_out=tmp_path), RunLog()
+    scene = stage_files.gaussians
+    command._render(scene, stage.views[:1], load_instances(found, scene), log)
+    assert titles == ["render"]
+    assert [path.endswith(f"{stage.views[0].stem}.png") for path in log.outputs] == [True, True]
 
 
 @pytest.mark.slow

@@ -182,6 +182,16 @@ def test_sources_without_a_key_are_always_asked(tmp_path, view, image):
     assert not list(tmp_path.iterdir())
 
 
+def test_a_source_that_knows_no_keys_is_always_asked(tmp_path, view, image):
+    source = Source()
+    plain = SimpleNamespace(space=source.space, needs_image=True, encode=source.encode)
+    cached = CachedMaps(plain, tmp_path)
+    for _ in range(2):
+        cached.encode(view, image)
+    assert (source.asked, cached.hits) == (2, 0)
+    assert not list(tmp_path.iterdir())
+
+
 def test_default_folder(monkeypatch, tmp_path):
     monkeypatch.setenv("SGWARP_CACHE", str(tmp_path / "here"))
     assert default_folder() == tmp_path / "here"

@@ -120,6 +120,15 @@ def test_long_lists_of_names_are_asked_in_several_prompts(gdino, view, image):
         GroundingDino(str(gdino), ("couch " * 40,))
 
 
+@pytest.mark.parametrize(("positions", "longest", "limit"), [(12, 256, 12), (256, 12, 12), (256, 64, 64)])
+def test_a_prompt_keeps_to_the_shorter_of_two_limits(gdino, positions, longest, limit):
+    encoder = GroundingDino(str(gdino), ("couch",) * 40)
+    encoder.model.config.text_config.max_position_embeddings = positions
+    encoder.model.config.max_text_len = longest
+    lengths = [len(owners) for _, _, owners in encoder._fill_prompts("grounding-dino")]
+    assert limit - 1 <= max(lengths) <= limit
+
+
 @pytest.mark.slow
 def test_owlv2(owlv2, tools, view, image):
     """Against the library's model on the image in the upper left corner of a grey square."""

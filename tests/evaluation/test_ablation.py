@@ -1,14 +1,20 @@
 """One thing changed at a time: each row is the evaluation with that option, and is not made twice."""
 
 import json
+from dataclasses import replace
 
 import pytest
 
 from sgwarp.cli import main
 from sgwarp.errors import InputError
 from sgwarp.evaluation import ablation
+from sgwarp.evaluation.ablation import Trial
+from sgwarp.evaluation.evaluator import Evaluation
 from sgwarp.evaluation.methods import Method, find_method
+from sgwarp.evaluation.networks import NetworkSettings
+from sgwarp.evaluation.profiles.room import ROOM
 from sgwarp.evaluation.settings import Settings
+from sgwarp.runs.log import RunLog
 
 OPTIONS = ("--encoder", "truth?noise=0.2", "--scenes", "one", "--sheets", "0")
 
@@ -101,6 +107,27 @@ def test_inputs_train_a_network_each(rooms, tmp_path):
 def test_a_base_off_the_axis_is_evaluated_as_well():
     listed = list(ablation.variants(Settings(share_of_views=0.5), ("views",)))
     assert [(one.value, bool(one.folder)) for one in listed] == [("100 %", True), ("30 %", True)]
+
+
+@pytest.mark.parametrize("axis", ["views", "gaussians"])
+def test_an_axis_changes_its_own_share_alone(axis):
+    base = Settings(sheets=0)
+    listed = list(ablation.variants(base, (axis,)))
+    assert [one.settings for one in listed] == [base, replace(base, **{f"share_of_{axis}": 0.3})]
+    assert [one.folder for one in listed] == ["", f"{axis}_0.3"]
+
+
+def test_variants_that_failed_are_counted(monkeypatch, tmp_path):
+    monkeypatch.setattr(ablation, "_try", lambda variant, *rest: Trial(variant, None, variant.folder and "lost"))
+    log, told = RunLog(), []
+    found = Evaluation(ROOM, Settings())
+    network = NetworkSettings()
+    result = ablation.ablate(
+        found, tmp_path, tmp_path, ("views",), network, log=log, progress=lambda *one: told.append(one)
+    )
+    assert [trial.error for trial in result.trials] == ["", "lost"]
+    assert log.left_out["variants_that_failed"] == 1
+    assert told == [(0, 2, ""), (1, 2, "views 100 %"), (2, 2, "views 30 %")]
 
 
 def test_axes():

@@ -334,7 +334,10 @@ def test_scannet_points_end_to_end(rooms, tmp_path, monkeypatch):
         v.stem: FeatureMap("names:40", ids=nyu[truth_of(rooms / "one", v.stem)] - 1, vectors=torch.eye(40))
         for v in views
     }
-    features = sg.lift(scene, views, maps).features.numpy()
+    lifted = sg.lift(scene, views, maps)
+    assert found["figures"]["coverage"] == pytest.approx(lifted.coverage)
+    assert lifted.coverage > 0.5
+    features = lifted.features.numpy()
     for count, ids in SETS.items():
         columns = np.array(ids) - 1
         guess = np.where(features[:, columns].max(1) > 0, np.array(ids)[features[:, columns].argmax(1)], 0)

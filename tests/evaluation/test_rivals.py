@@ -21,9 +21,12 @@ def half_transparent(stage) -> Gaussians:
 
 
 def test_every_gaussian_has_the_feature_of_its_nearest_point(stage):
-    scene = half_transparent(stage)
-    found = fuse_nearest_points(scene, stage.views, stage.one_hot)
-    fused = lift(scene, stage.views, stage.one_hot, "center", tau=TOLERANCE, border=0)
+    scene, noise = half_transparent(stage), torch.Generator().manual_seed(0)
+    maps = {
+        view.stem: FeatureMap("t", dense=torch.randn(*view.camera.size, 4, generator=noise)) for view in stage.views
+    }
+    found = fuse_nearest_points(scene, stage.views, maps)
+    fused = lift(scene, stage.views, maps, "center", tau=TOLERANCE, border=0)
     points = np.flatnonzero((fused.seen & (scene.opacities >= OPAQUE)).numpy())
     means = scene.means.double().numpy()
     for row in range(0, len(scene), 211):
@@ -62,6 +65,19 @@ def test_what_no_view_sees_stays_unseen(stage):
     fitted = fit_features(stage.gaussians, [view], maps, steps=3)
     assert 0 < fitted.coverage < 0.2
     assert (fitted.features[~fitted.seen] == 0).all()
+
+
+def test_what_any_step_sees_is_seen(stage):
+    """Two views that show different things, one step each."""
+    views, maps = stage.views[:2], {}
+    for view, rows in zip(views, (slice(0, 20), slice(-20, None)), strict=True):
+        ids = torch.full(view.camera.size, -1)
+        ids[rows] = 0
+        maps[view.stem] = FeatureMap("t", ids=ids, vectors=torch.ones(1, 3))
+    one, other = (fit_features(stage.gaussians, [view], maps, steps=1).seen for view in views)
+    assert bool((one & ~other).any())
+    assert bool((other & ~one).any())
+    assert torch.equal(fit_features(stage.gaussians, views, maps, steps=2).seen, one | other)
 
 
 def test_refusals(stage):

@@ -5,9 +5,13 @@ import json
 import pytest
 
 from sgwarp.errors import InputError
+from sgwarp.evaluation.evaluator import Evaluation
 from sgwarp.evaluation.methods import METHOD_KINDS, Method, find_method, list_methods
 from sgwarp.evaluation.profiles.catalogue import PLACES, find_profile
 from sgwarp.evaluation.published import FILE, find_published
+from sgwarp.evaluation.report_files import headline
+from sgwarp.evaluation.results import SceneResult
+from sgwarp.evaluation.settings import Settings
 from sgwarp.evaluation.tables import Table, number, percent, seconds_of, size
 
 
@@ -82,6 +86,20 @@ def test_every_profile_can_be_made_and_names_published_figures():
             assert set(row.figures) & {*profile.headline, *(f"micro_{one}" for one in profile.headline)} or row.kind
     with pytest.raises(InputError, match="does not exist"):
         find_profile("imagenet")
+
+
+@pytest.mark.parametrize("profile", ["lerf-ovs-3d", "scannet-3d"])
+def test_stated_times_stand_under_lifting(profile):
+    protocol = find_profile(profile)
+    result = SceneResult("attic", seconds={"lift": 2.0, "query": 0.5, "read": 9.0}, peak_memory=2_000_000_000)
+    table = headline(Evaluation(protocol, Settings(), [result]))
+    assert table.columns[-5:] == ["lifting [s]", "asking [s]", "memory", "B/Gaussian", "source"]
+    assert table.rows[0][-5:] == ["2.00", "0.50", "2.00 GB", "0", "this run"]
+    published = find_published(profile)
+    assert any(row.seconds for row in published)
+    for row, cells in zip(published, table.rows[1:], strict=True):
+        assert len(cells) == len(table.columns)
+        assert cells[-5:-1] == [row.seconds or "–", "–", "–", "–"]
 
 
 def test_methods():

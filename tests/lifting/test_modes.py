@@ -1,11 +1,13 @@
 """Lift modes against dense float64 linear algebra, Weiszfeld's iteration in numpy, and views that are wrong."""
 
-from dataclasses import replace
+import inspect
+from dataclasses import asdict, fields, replace
 
 import numpy as np
 import pytest
 import torch
 
+from sgwarp.commands.lift import Lift
 from sgwarp.errors import InputError
 from sgwarp.lifting import lifter, ridge, robust
 from sgwarp.lifting.holes import TRUST, fill_holes
@@ -258,6 +260,16 @@ def test_filling_is_counted_and_leaves_the_coverage(stage):
     filled = lift(stage.gaussians, some, stage.one_hot, lift_settings=LiftSettings(fill=3), log=log)
     assert filled.coverage == 1.0 > plain.coverage == log.error["coverage"]
     assert log.left_out["unseen_gaussians_filled"] == int((~plain.seen).sum())
+
+
+def test_defaults_are_the_same_wherever_they_are_given():
+    """As arguments of `lift`, as settings of the modes, and as options of the command."""
+    settings, options = asdict(LiftSettings()), {one.name: one.default for one in fields(Lift)}
+    arguments = {name: one.default for name, one in inspect.signature(lift).parameters.items()}
+    for others, count in ((arguments, 2), (options, 7)):
+        shared = settings.keys() & others.keys()
+        assert len(shared) == count
+        assert {name: others[name] for name in shared} == {name: settings[name] for name in shared}
 
 
 @pytest.mark.parametrize(

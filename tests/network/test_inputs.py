@@ -124,6 +124,13 @@ def test_raw_inputs_are_what_a_ply_file_stores():
     assert not plain[:, 4:49].any()
 
 
+def test_raw_inputs_keep_faint_and_opaque_gaussians_apart():
+    opacities = torch.tensor([1e-4, 1e-3, 5e-3, 0.995, 0.999])
+    logit = input_features(replace(scene(5), opacities=opacities), "raw56", 0.02)[:, 0]
+    exact = torch.tensor([math.log(a / (1 - a)) for a in opacities.tolist()])
+    torch.testing.assert_close(logit, exact, rtol=0, atol=1e-3)
+
+
 @pytest.mark.parametrize("mode", list(INPUT_CHANNELS))
 def test_inputs_are_finite_for_flat_transparent_and_opaque_gaussians(mode):
     gaussians = scene(4)

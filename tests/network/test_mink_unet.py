@@ -102,6 +102,14 @@ def test_a_small_net_is_the_dense_one():
     assert float((y.features - expected).detach().abs().max()) < 1e-12
 
 
+@pytest.mark.parametrize("dilation", [1, 2, 3])
+def test_a_dilated_layer_is_the_dense_one(dilation):
+    x = cloud(channels=4, spread=6, dtype=torch.float64)
+    layer = Conv(4, 5, dilation=dilation).double()
+    expected = reference_sparse.convolve(x.features, layer.kernel, x.coordinates, x.coordinates, 3, dilation)
+    assert float((layer(x).features - expected).detach().abs().max()) < 1e-12
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize("arch", ["14A", "34A"])
 def test_every_parameter_gets_a_gradient(arch):

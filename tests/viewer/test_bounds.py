@@ -114,6 +114,8 @@ def test_messages_that_the_panel_needs_are_accepted():
     assert accepts(message("GuiUpdateMessage", uuid="u", updates={"value": (230, 60, 40)}))
     assert accepts(message("FileTransferStartUpload", size_bytes=10, part_count=1, filename="a", mime_type="image/png"))
     assert accepts(message("FileTransferPart", content=b"0123456789"))
+    assert accepts(message("FileTransferPartAck"))
+    assert accepts(message("CommandTriggerMessage", uuid="u"))
 
 
 @pytest.mark.parametrize(

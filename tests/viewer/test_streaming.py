@@ -13,7 +13,7 @@ from sgwarp.ops import launcher
 from sgwarp.ops.launcher import Interrupted, interruptible
 from sgwarp.rendering.renderer import render
 from sgwarp.viewer import screen as screen_module
-from sgwarp.viewer.modes import Shot
+from sgwarp.viewer.modes import Drawn, Shot
 from sgwarp.viewer.pace import GOAL, SIZES, SLOWEST, Pace
 from sgwarp.viewer.screen import Canvas
 from sgwarp.viewer.streaming import SHORTEST, Stream, Streamer
@@ -159,6 +159,17 @@ def test_a_picture_waits_until_it_is_due(stage, camera):
 def test_a_canvas_is_busy_while_its_client_has_not_taken_the_picture(monkeypatch, waits):
     monkeypatch.setattr(screen_module, "is_waiting", lambda client: client.waits)
     assert Canvas(SimpleNamespace(waits=waits), print).busy is waits
+
+
+def test_a_moving_picture_is_coarser_than_the_one_that_stays():
+    sent = []
+    scene = SimpleNamespace(set_background_image=lambda pixels, **options: sent.append(options))
+    canvas = Canvas(SimpleNamespace(scene=scene, flush=lambda: None), print)
+    drawn = Drawn(np.zeros((8, 12, 3), np.uint8), np.ones((8, 12), np.float32))
+    for final in (False, True):
+        canvas.show(drawn, final)
+    assert sent[0]["jpeg_quality"] < sent[1]["jpeg_quality"]
+    assert [one["depth"].shape for one in sent] == [(2, 3), (8, 12)]
 
 
 def test_a_tab_that_was_removed_gets_nothing(streamer, stage, camera):

@@ -11,7 +11,10 @@ import torch
 from sgwarp.cli import main
 from sgwarp.errors import InputError
 from sgwarp.evaluation.report import oracle
+from sgwarp.evaluation.report.extremes import Extreme
+from sgwarp.evaluation.report.page import Findings, Stability, write_json, write_page
 from sgwarp.evaluation.report.run import split_views
+from sgwarp.evaluation.report.stability import ImageResult
 from sgwarp.evaluation.report.sweep import Trial, pareto_front, rendering_variants
 from sgwarp.files.images import read_rgb
 from sgwarp.io.scenes import save_gaussians
@@ -173,6 +176,53 @@ def test_files_are_whole(written):
     assert run["error"]["default_miou"] > 0.8
     assert run["error"]["rounding"] < 2e-5
     assert len(run["outputs"]) == 3
+
+
+ABOUT = {"scene": "attic", "gaussians": 1234, "width": 640, "height": 480, "device": "CPU", "threads": 2}
+ABOUT |= {"version": "1.2.3", "repeats": 5, "pixels": 4608, "patch": 48, "held_out": ["v1", "v3"], "lifted": 7}
+
+
+def row_of(page: str, start: str) -> list[str]:
+    """Cells of the one row of a page's tables that starts so."""
+    (row,) = [line for line in page.splitlines() if line.startswith(f"| {start} |")]
+    return [cell.strip() for cell in row.strip("|").split("|")]
+
+
+def test_every_figure_stands_in_its_column(tmp_path):
+    seen = {"max": 0.05, "mean": 0.002, "psnr": 41.25, "psnr_photograph": 31.5}
+    rendering = [
+        Trial("default", "", 0.004, 0.0001, seen),
+        Trial("SH degree", "0", 0.002, 0.0002, {**seen, "psnr": 30}),
+    ]
+    lifting = [Trial("default", "", 2.5, 0.125, {"miou": 0.75, "pixel_accuracy": 0.875, "coverage": 0.5})]
+    findings = Findings(ABOUT, 3e-6, rendering, lifting)
+    write_page(findings, tmp_path / "report.md")
+    write_json(findings, tmp_path / "report.json")
+    page = (tmp_path / "report.md").read_text()
+    assert "1,234 Gaussians, 640 x 480 pixels, CPU with 2 threads, sgwarp 1.2.3" in page
+    assert "medians of 5 runs" in page
+    assert "at 4,608 pixels in patches of 48 x 48 of the held-out views v1, v3;" in page
+    assert "the renderer is 0.05 off at worst" in page
+    assert "with the same cut-offs it is 3.0e-06, the rounding" in page
+    assert "Label images of 7 views lifted into the scene, the 2 held-out" in page
+    figures = ["2.0 ± 0.2", "2.00", "0.05", "0.002", "30.0", "31.50"]
+    assert row_of(page, "SH degree") == ["SH degree", "0", *figures, "●"]
+    assert page.count("| **default** |  | 2.500 ± 0.125 | 1.00 | 0.7500 | 0.8750 | 50.0% | ● |") == 1
+    record = json.loads((tmp_path / "report.json").read_text())
+    assert (record["about"], record["rounding"]) == (ABOUT, 3e-6)
+    assert record["lifting"][0]["errors"] == lifting[0].errors
+
+
+@pytest.mark.parametrize(("device", "told"), [("CPU", "the worse of the two is shown"), ("H100", "of GPUs on H100.")])
+def test_the_page_says_in_which_schedule_the_extremes_were_drawn(tmp_path, device, told):
+    extreme = Extreme("flat", "one scale is 0", lambda: None, "as it is", image_bound=1e-4)
+    image = ImageResult(finite=True, error=1e-5, depth_error=0.0, undecidable=0.0, culled={}, seconds=0.1)
+    stability = [Stability(extreme, "lanes", 200, image, None)]
+    rendering = [Trial("default", "", 0.004, 0.0001, {"max": 0.05, "mean": 0.002, "psnr": 41.25})]
+    write_page(Findings({**ABOUT, "device": device}, 3e-6, rendering, stability=stability), tmp_path / "report.md")
+    page = (tmp_path / "report.md").read_text()
+    assert told in page
+    assert ("in the schedule of GPUs on" in page) is (device != "CPU")
 
 
 @pytest.mark.slow

@@ -265,6 +265,8 @@ def test_schedules():
     assert settings.means_rate_at(0, 2.0) == pytest.approx(3.2e-4)
     assert settings.means_rate_at(6000, 2.0) == pytest.approx(3.2e-6)
     assert settings.means_rate_at(3000, 2.0) == pytest.approx(3.2e-5)
+    steady = FitSettings(steps=6000, last_means_rate=0.0)  # nothing falls exponentially to 0
+    assert [steady.means_rate_at(step, 2.0) for step in (0, 6000)] == pytest.approx([3.2e-4] * 2)
     assert [settings.degree_at(step) for step in (0, 999, 1000, 2500, 5900)] == [0, 0, 1, 2, 3]
     assert settings.scaled(15_000) == 3000
 
