@@ -25,6 +25,7 @@ MOST_VIEWS, MOST_POINTS = 10, 250  # whose points are compared, and of each
 REACH, RATIO, FINE_RATIO = 1e5, 1.08, 1.005  # of the factors that are tried, and between two of them
 CLOSE = 0.04  # relative difference of depth that counts as agreement
 NEARLY = 0.95  # of the best agreement, from which on a factor is as good, and a round one is meant
+CLEARLY = 2  # times as many points must disagree in the unit given, for another to be believed
 LEAST_POINTS = 200  # that fall into other views, to say anything
 
 
@@ -71,9 +72,13 @@ def measure_depth_unit(depths: Sequence[Array], cameras: Sequence[Camera], exten
     factor, most = _widest(pairs, np.exp(np.arange(-math.log(REACH), math.log(REACH), math.log(RATIO))))
     factor, fine = _widest(pairs, factor * FINE_RATIO ** np.arange(-20.0, 21.0))
     most = max(most, fine)
-    for simple in (1.0, 10.0 ** round(math.log10(factor))):
-        if (agreement := pairs.agreement(simple)) >= NEARLY * most:
-            return DepthUnit(simple, agreement, as_given)
+    # Depth that fits badly in any unit fits a little less badly in some; far away, where nothing has parallax, often.
+    hardly_better = as_given > most / 2 and 1 - as_given < CLEARLY * (1 - most)
+    if hardly_better or as_given >= NEARLY * most:
+        return DepthUnit(1.0, as_given, as_given)
+    simple = 10.0 ** round(math.log10(factor))
+    if (agreement := pairs.agreement(simple)) >= NEARLY * most:
+        return DepthUnit(simple, agreement, as_given)
     return DepthUnit(factor, pairs.agreement(factor), as_given)
 
 

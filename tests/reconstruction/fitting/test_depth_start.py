@@ -64,6 +64,14 @@ def test_where_another_unit_is_as_good_the_one_given_counts(boards):
     assert measure_depth_unit(*zip(*small, strict=True), camera_extent(boards.views)).factor == 1
 
 
+def test_no_other_unit_is_believed_that_is_hardly_better(views):
+    """The same depth in every pixel is wrong in all views; far away, without parallax, it agrees a little more."""
+    small = [shrink_depth(np.full(view.camera.size, 3.0), view.camera) for view in views]
+    found = measure_depth_unit(*zip(*small, strict=True), camera_extent(views))
+    assert found.factor == 1
+    assert found.agreement == found.as_given < 0.2
+
+
 def test_views_that_share_nothing_say_nothing_of_the_unit(views, caplog):
     found = usable_depth("depth", depth, views[:1])
     assert "depth: too little of one view shows in others to check the unit" in caplog.text
