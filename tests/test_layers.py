@@ -25,6 +25,7 @@ FLOORS = (
     ("demo",),
     ("commands",),
     ("cli",),
+    ("__main__",),
 )
 FLOOR = {name: level for level, names in enumerate(FLOORS) for name in names}
 # What few use, and what makes `import sgwarp` slow or impossible where it is not installed.

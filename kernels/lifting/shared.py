@@ -3,12 +3,12 @@
 import warp as wp
 
 from sgwarp.kernels.binning import TILE
-from sgwarp.kernels.gaussian import Splat
+from sgwarp.kernels.gaussian import EXACT_OPTIONS, Splat
 from sgwarp.kernels.projection.forward import VISIBLE
 from sgwarp.kernels.transmittance import LaneIds, Lanes
 
 # Loops over the rows and pixels of a tile stay loops: unrolled they compile for seconds and run no faster.
-wp.set_module_options({"enable_backward": False, "fast_math": False, "max_unroll": 1})
+wp.set_module_options({**EXACT_OPTIONS, "max_unroll": 1})
 
 ROWS_AHEAD = wp.constant(16)  # entries between the one that is added and the one that is fetched
 MAX_IDS = wp.constant(256)  # a tile has 256 pixels, so no more ids

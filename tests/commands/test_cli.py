@@ -2,6 +2,7 @@
 
 import json
 import shutil
+import subprocess
 import sys
 
 import cv2
@@ -217,6 +218,13 @@ def test_info_names_the_rows_that_cannot_be_rendered(stage, tmp_path, capsys):
     facts = json.loads(capsys.readouterr().out)
     assert facts["non_finite_rows"] == 1
     assert sum(facts["opacity_histogram"]) == len(scene) - 1
+
+
+def test_python_runs_the_package():
+    command = [sys.executable, "-m", "sgwarp", "info", "no.ply"]
+    done = subprocess.run(command, capture_output=True, text=True, check=False)
+    assert done.returncode == 2
+    assert done.stderr.startswith("sgwarp: no.ply: ")
 
 
 def test_version(capsys):

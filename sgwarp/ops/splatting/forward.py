@@ -16,7 +16,7 @@ from sgwarp.kernels.native import BATCH, Seen
 from sgwarp.kernels.transmittance import Lanes
 from sgwarp.ops.launcher import fresh, get_threads, launch, launch_blocks, scratch, view, warp_device
 from sgwarp.ops.splatting import tiles
-from sgwarp.ops.splatting.loading import load_rendering
+from sgwarp.ops.splatting.loading import WIDE_PASS, load_rendering, load_wide_rendering
 from sgwarp.ops.splatting.plan import RenderPlan, Values, plan_render
 from sgwarp.ops.splatting.room import ListRoom
 from sgwarp.ops.splatting.settings import RasterSettings
@@ -24,7 +24,6 @@ from sgwarp.scene import Camera, Gaussians
 from sgwarp.scene.checks import require_finite
 
 LANE = 16
-WIDE_PASS = 4  # slices of 16 channels that one walk over the tiles composites; more would leave the cache
 
 
 @dataclass(frozen=True, eq=False)
@@ -99,6 +98,8 @@ def rasterize(
         plan = plan_render(gaussians, values, channels=channels, depth=wants_depth, settings=settings, look=look)
     if channels <= 3:
         load_rendering(gaussians.device, harmonics=plan.values == "colors", depth=plan.depth)
+    else:
+        load_wide_rendering(gaussians.device, channels, depth=plan.depth)
     projected = tiles.project(gaussians, camera, settings)
     tiles.leave_out_non_finite(projected, features)
     order = tiles.depth_order(projected)

@@ -23,6 +23,7 @@ from sgwarp.ops.launcher import launch, launch_blocks, launch_plain, scratch, vi
 from sgwarp.ops.splatting import tiles
 from sgwarp.ops.splatting.forward import LANE, TILE_ROWS, in_slices, lane_scratch
 from sgwarp.ops.splatting.id_weights import localize_ids, weigh_ids
+from sgwarp.ops.splatting.lift_loading import load_lifting
 from sgwarp.ops.splatting.lift_sums import LiftSums as LiftSums
 from sgwarp.ops.splatting.pixel_lifting import add_centers, add_strongest
 from sgwarp.ops.splatting.settings import RasterSettings
@@ -87,9 +88,12 @@ def lift_view(
     if mode == "strongest":
         add_strongest(gaussians, camera, feature_map, sums, settings)
         return
+    by_rows = mode != "center"
+    if by_rows:
+        ids, squared = feature_map.ids is not None, mode == "squared"
+        load_lifting(gaussians.device, sums.channels, ids=ids, squared=squared)
     projected = tiles.project(gaussians, camera, settings)
     order = tiles.depth_order(projected)
-    by_rows = mode != "center"
     wants_tiles = by_rows and feature_map.ids is not None
     lists = tiles.bin_splats(projected, order, None, camera, places=by_rows, tiles=wants_tiles)
     if mode == "center":

@@ -1,4 +1,7 @@
-"""Loading the kernels of a rendering side by side, before the first of them is asked for."""
+"""Loading kernels side by side, before the first of them is asked for.
+
+The longest come first, and one of each set of compiler options: modules that share them share compiled headers.
+"""
 
 from __future__ import annotations
 
@@ -8,11 +11,15 @@ import warp as wp
 from sgwarp.kernels import binning
 from sgwarp.kernels.compositing.lanes import make_composite_colors
 from sgwarp.kernels.compositing.lanes_backward import make_composite_backward
+from sgwarp.kernels.compositing.lanes_features import make_composite_features
 from sgwarp.kernels.harmonics.backward import harmonics_backward
 from sgwarp.kernels.harmonics.forward import evaluate_harmonics
 from sgwarp.kernels.projection import lanes as projection_lanes
 from sgwarp.kernels.projection.backward import sum_intersections
+from sgwarp.kernels.transmittance import LANES
 from sgwarp.ops.launcher import load_together
+
+WIDE_PASS = 4  # slices of 16 channels that one walk over the tiles takes; more would leave the cache
 
 
 def load_rendering(
@@ -29,10 +36,24 @@ def load_rendering(
     """
     if device.type != "cpu":
         return
-    # The longest first, and one of each set of compiler options: modules that share them share compiled headers.
-    # Both kernels of the projection are in one module.
     colors = make_composite_colors(depth, backward)
     needed: list[wp.Kernel] = [make_composite_backward(False, depth, absolute) if backward else colors]
+    # Both kernels of the projection are in one module.
     needed += [projection_lanes.project_groups, colors] + [evaluate_harmonics] * harmonics + [binning.count_tiles]
     needed += [sum_intersections] * backward + [harmonics_backward] * (harmonics and backward)
     load_together(needed)
+
+
+def load_wide_rendering(device: torch.device, channels: int, *, depth: bool) -> None:
+    """Load what compositing more than three channels on the CPU needs, without a backward pass."""
+    if device.type != "cpu":
+        return
+    first, *others = (make_composite_features(width, False) for width in pass_widths(channels))
+    needed: list[wp.Kernel] = [first, projection_lanes.project_groups, *others]
+    load_together([*needed, *[make_composite_colors(True, False)] * depth, binning.count_tiles])
+
+
+def pass_widths(channels: int) -> list[int]:
+    """Different widths of the passes over so many channels [slices of 16]."""
+    wide, narrow = divmod(-(-channels // LANES), WIDE_PASS)
+    return [WIDE_PASS] * (wide > 0) + [1] * (narrow > 0)

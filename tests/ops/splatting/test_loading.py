@@ -6,6 +6,10 @@ import warp as wp
 
 import sgwarp as sg
 from sgwarp.ops import launcher
+from sgwarp.ops.splatting.forward import rasterize
+from sgwarp.ops.splatting.lift_sums import LiftSums
+from sgwarp.ops.splatting.lifting import lift_view
+from sgwarp.scene import FeatureMap
 
 
 @pytest.fixture
@@ -53,3 +57,28 @@ def test_what_is_loaded_is_not_loaded_again(make_scene, modules):
     loaded.clear()
     assert torch.equal(sg.render(gaussians, camera), first)
     assert not loaded
+
+
+@pytest.mark.parametrize("channels", [4, 64, 80, 160])
+@pytest.mark.parametrize("depth", [False, True])
+def test_many_channels_load_what_they_launch(make_scene, modules, channels, depth):
+    loaded, launched = modules
+    _, gaussians, camera = make_scene("random_cloud")
+    rasterize(gaussians, camera, features=torch.rand(len(gaussians), channels), expected_depth=depth)
+    assert launched
+    assert loaded == launched
+
+
+@pytest.mark.parametrize("mode", ["weighted", "squared"])
+@pytest.mark.parametrize("channels", [0, 3, 80, 160])
+def test_lifting_loads_what_it_launches(make_scene, modules, mode, channels):
+    """No channels are an id map."""
+    loaded, launched = modules
+    _, gaussians, camera = make_scene("random_cloud")
+    if channels:
+        found = FeatureMap("x", dense=torch.rand(camera.height, camera.width, channels))
+    else:
+        found = FeatureMap("labels", ids=torch.zeros(camera.size, dtype=torch.int32), labels=("chair",))
+    lift_view(gaussians, camera, found, LiftSums.zeros(len(gaussians), found.channels), mode=mode)
+    assert launched
+    assert loaded == launched
