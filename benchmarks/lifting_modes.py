@@ -40,11 +40,10 @@ from sgwarp.scene import FeatureMap, Semantics, View
 
 Row = dict[str, Any]
 SHARES = (1.0, 0.5, 0.2, 0.1)
-SOLVED = ("100% of views", "10% of views")  # where the slowest mode runs
 ARRAYS = {"weighted": 1, "center": 1, "squared": 1, "strongest": 1, "robust": 4, "solve": 2, "reliable": 2}
 FITTED_ARRAYS = 4  # features, gradient, and both moments of Adam
 FITS = {"fitted": None, "fitted, 8 channels": 8}
-LOOK_AT = (10, 30, 100, 300)
+LOOK_AT = (10, 30, 100, 300, 1000, 3000)
 CHOICES: dict[str, list[dict[str, Any]]] = {
     "center": [{"tau": tau, "border": border} for tau in (0.02, 0.05, 0.25) for border in (0, 10)],
     "robust": [{"passes": p, "smoothing": s} for p, s in ((2, 1e-3), (4, 1e-3), (8, 1e-3), (4, 1e-1))],
@@ -114,8 +113,6 @@ def sweep(rooms: dict[str, LabelledRoom], results: Row, save: Callable[[Row], No
     for what in next(iter(parts.values())):
         for name, part in ((name, found[what]) for name, found in parts.items()):
             for method, (mode, settings, arrays) in tuned(results).items():
-                if mode == "solve" and what not in SOLVED:
-                    continue
                 row = rows[f"{name}, {what}, {method}"] = lift_with(part, mode, settings, arrays)
                 _tell(name, what, method, row)
             save(rows)
@@ -195,8 +192,6 @@ def encoder(rooms: dict[str, LabelledRoom], results: Row, save: Callable[[Row], 
     known = (room.of_gaussians >= 0) & (room.of_gaussians < len(furniture))
     rows: Row = {}
     for method, (mode, settings, arrays) in tuned(results).items():
-        if mode == "solve":  # with 512 channels its many renderings take longer than all others together
-            continue
         log = RunLog()
         start = time.perf_counter()
         semantics = sg.lift(room.gaussians, room.views, maps, mode, lift_settings=settings, log=log)
