@@ -2,6 +2,7 @@
 
 import json
 import os
+import shutil
 import signal
 import subprocess
 import sys
@@ -10,6 +11,8 @@ from pathlib import Path
 import pytest
 
 from sgwarp.cli import main
+from sgwarp.datasets.moving import make_moving_scene
+from sgwarp.datasets.moving_files import save_moving_scene
 from sgwarp.files.atomic import atomic_path
 from sgwarp.io.scenes import load_gaussians
 
@@ -24,10 +27,38 @@ def lifted(stage_files, tmp_path_factory) -> Path:
     return out
 
 
-def arguments(name: str, files, lifted: Path, out: Path) -> list[str]:
+@pytest.fixture(scope="module")
+def others(stage_files, lifted, tmp_path_factory):
+    """What the commands on networks, moving scenes and lists of scenes read."""
+    root = tmp_path_factory.mktemp("others")
+    save_moving_scene(make_moving_scene(0, 2, 300, cameras=2, width=32, height=24, moving_share=0.5), root / "moving")
+    shutil.copytree(stage_files.views, root / "list" / "one")
+    shutil.copy(stage_files.scene, root / "list" / "one" / "scene.ply")
+    (root / "data").mkdir()
+    shutil.copy(stage_files.scene, root / "data" / "room.ply")
+    shutil.copy(lifted, root / "data" / "room.safetensors")
+    make = ["distill", root / "data", "--out", root / "net.safetensors", *TRAINING]
+    assert main([*map(str, make)]) == 0
+    # Its kernels are compiled, as those of the other commands are by now: a full disk has no room for them either.
+    assert main(arguments("track", stage_files, lifted, root, root / "tracked")) == 0
+    return root
+
+
+TRAINING = ("--epochs", "1", "--voxel", "0.25", "--up", "y", "--arch", "14A")
+
+
+def arguments(name: str, files, lifted: Path, others: Path, out: Path) -> list[str]:
     """A small run of a command that writes to `out`."""
     scene, views = files.scene, ["--views", files.views]
+    maps = ["--encoder", f"files:{files.labels}", "--cache", "none"]
+    moving = others / "moving"
     lines = {
+        "lift": [scene, *views, *maps, "--out", out / "S.safetensors"],
+        "distill": [others / "data", "--out", out / "n.safetensors", *TRAINING],
+        "predict": [scene, "--net", others / "net.safetensors", "--out", out / "P.safetensors"],
+        "track": [*(moving / "params.npz", "--views", moving, "--encoder", f"files:{moving / 'labels'}", "--out", out)],
+        "batch": [others / "list", "--do", "render", "--out", out, "--threads", "1"],
+        "poses": [files.views, "--out", out / "posed"],
         "render": [scene, *views, "--view", "0001", "--out", out / "a.png"],
         "segment": [scene, "--semantics", lifted, *views, "--classes", "1,2", "--out", out],
         "query": [scene, "--semantics", lifted, *views, "--view", "0001", "--text", "1", "--out", out / "q.png"],
@@ -41,28 +72,38 @@ def arguments(name: str, files, lifted: Path, out: Path) -> list[str]:
 
 
 COMMANDS = ("render", "segment", "query", "convert", "edit", "fit", "instances", "report")
+COMMANDS += ("lift", "distill", "predict", "track", "batch")
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("name", COMMANDS)
-def test_a_command_on_a_full_disk(stage_files, lifted, tmp_path, capsys, disk, name):
+def test_a_command_on_a_full_disk(stage_files, lifted, others, tmp_path, capsys, disk, name):
     """One line that names the file, exit code 2, and no rest of anything."""
     out = tmp_path / "out"
     out.mkdir()
     with disk(60):
-        assert main(arguments(name, stage_files, lifted, out)) == 2
+        assert main(arguments(name, stage_files, lifted, others, out)) == 2
     last = capsys.readouterr().err.strip().splitlines()[-1]
     assert last.startswith(f"sgwarp: {out}")
     assert "cannot be written (File too large)" in last
     assert [path for path in out.rglob("*") if path.is_file() and path.stat().st_size] == []
 
 
-@pytest.mark.parametrize("name", COMMANDS)
-def test_a_command_in_a_place_that_refuses(stage_files, lifted, tmp_path, capsys, name):
+def test_poses_on_a_full_disk(stage_files, lifted, others, tmp_path, capsys, disk):
+    pytest.importorskip("pycolmap")
+    with disk(60):
+        assert main(arguments("poses", stage_files, lifted, others, tmp_path)) == 2
+    last = capsys.readouterr().err.strip().splitlines()[-1]
+    assert last.startswith(f"sgwarp: {tmp_path / 'posed' / 'database.db'}: structure from motion cannot go on")
+    assert "if the disk is full" in last
+
+
+@pytest.mark.parametrize("name", [*COMMANDS, "poses"])
+def test_a_command_in_a_place_that_refuses(stage_files, lifted, others, tmp_path, capsys, name):
     """A file stands where the folder should be; nothing is computed before that is said."""
     blocked = tmp_path / "file"
     blocked.write_text("here first")
-    assert main(arguments(name, stage_files, lifted, blocked / "out")) == 2
+    assert main(arguments(name, stage_files, lifted, others, blocked / "out")) == 2
     last = capsys.readouterr().err.strip().splitlines()[-1]
     assert last.startswith("sgwarp: ")
     assert str(blocked) in last

@@ -11,7 +11,7 @@ from typing import Any, Literal
 
 from sgwarp.errors import InputError
 from sgwarp.files.images import read_size
-from sgwarp.reconstruction.sfm.library import require_pycolmap, run_cancellable
+from sgwarp.reconstruction.sfm.library import require_pycolmap, require_room, run_cancellable
 from sgwarp.runs.progress import Report
 
 Matching = Literal["auto", "exhaustive", "sequential"]
@@ -19,6 +19,9 @@ MOST_EXHAUSTIVE = 150  # photographs of which every one is compared with every o
 OVERLAP = 12  # photographs after each that it is compared with in a sequence, and at doubling distances
 PHOTOGRAPHS_AT_ONCE, PAIRS_AT_ONCE = 8, 64  # between two reports of the progress
 LARGEST = 1600  # photographs are made this small for features [pixels]
+# At most 8192 features a photograph, of 24 bytes and 128 of their descriptor; of a pair as many matches, 8 bytes each,
+# stored twice: as found, and as checked.
+PHOTOGRAPH_BYTES, PAIR_BYTES = 8192 * 152, 2 * 8192 * 8
 SMALL, FAINT = 1000, 0.003  # photographs whose sides are shorter have few features: fainter ones count, too [pixels]
 
 
@@ -67,6 +70,7 @@ def store_features(
 ) -> None:
     """Store the features of some photographs of one size, taken with a camera of the database or with new ones."""
     pycolmap = require_pycolmap()
+    require_room(database, len(names) * PHOTOGRAPH_BYTES)
     options, reader = pycolmap.FeatureExtractionOptions(), pycolmap.ImageReaderOptions()
     options.max_image_size, options.num_threads, options.use_gpu = LARGEST, settings.threads, False
     if max(read_size(folder / names[0])) < SMALL:
@@ -88,7 +92,7 @@ def store_features(
             cancellation_token=token,
         )
 
-    run_cancellable(extract)
+    run_cancellable(database, extract)
 
 
 def _camera_of(database: Path, names: set[str]) -> int | None:
@@ -126,8 +130,9 @@ def match_features(database: Path, pairs: Sequence[tuple[str, str]], settings: S
         for start in range(0, len(pairs), PAIRS_AT_ONCE):
             report(start, len(pairs), "matching photographs")
             chunk = pairs[start : start + PAIRS_AT_ONCE]
+            require_room(database, len(chunk) * PAIR_BYTES)
             listed.write_text("".join(f"{a} {b}\n" for a, b in chunk), encoding="utf-8")
-            run_cancellable(match)
+            run_cancellable(database, match)
     finally:
         listed.unlink(missing_ok=True)
     report(len(pairs), len(pairs), "matching photographs")
@@ -140,6 +145,7 @@ def _match_all(database: Path, pairs: Sequence[tuple[str, str]], settings: SfmSe
     options.num_threads, options.use_gpu = settings.threads, False
     sequence.overlap, sequence.quadratic_overlap = OVERLAP, True
     count = len({name for pair in pairs for name in pair})
+    require_room(database, len(pairs) * PAIR_BYTES)
     common = {"matching_options": options, "device": pycolmap.Device.cpu}
 
     def match(token: Any) -> None:
@@ -148,7 +154,7 @@ def _match_all(database: Path, pairs: Sequence[tuple[str, str]], settings: SfmSe
         else:
             pycolmap.match_sequential(database, pairing_options=sequence, cancellation_token=token, **common)
 
-    run_cancellable(match, lambda: report(0, len(pairs), "matching photographs"))
+    run_cancellable(database, match, lambda: report(0, len(pairs), "matching photographs"))
 
 
 def choose_pairs(names: Sequence[str], matching: Matching) -> list[tuple[str, str]]:

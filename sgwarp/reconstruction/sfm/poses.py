@@ -198,7 +198,7 @@ def _attempt(database: Path, folder: Path, work: Path, options: Any, count: int,
             database, folder, work, options=options, next_image_callback=note, cancellation_token=token
         )
 
-    models = run_cancellable(run, lambda: report(min(placed, count), count, "placing photographs"))
+    models = run_cancellable(database, run, lambda: report(min(placed, count), count, "placing photographs"))
     shutil.rmtree(work, ignore_errors=True)
     return models
 

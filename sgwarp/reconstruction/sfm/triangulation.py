@@ -156,7 +156,7 @@ class _Model:
                 model, self.database, self.folder, out, options=options, cancellation_token=token
             )
 
-        return run_cancellable(run, lambda: self.report(0, 1, "triangulating"))
+        return run_cancellable(self.database, run, lambda: self.report(0, 1, "triangulating"))
 
 
 def _pairs(cameras: Sequence[Camera]) -> set[tuple[int, int]]:

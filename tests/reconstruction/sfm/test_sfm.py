@@ -36,6 +36,15 @@ def found(corner, tmp_path_factory):
     return folder, out, estimate_poses(folder, out, SfmSettings(threads=1))
 
 
+def test_a_disk_without_room_is_said_before_the_library_ends_the_process(corner, tmp_path, monkeypatch):
+    """COLMAP aborts where its database cannot grow."""
+    usage = shutil.disk_usage(tmp_path)
+    monkeypatch.setattr(shutil, "disk_usage", lambda path: usage._replace(free=40 * 2**20))
+    with pytest.raises(InputError, match=r"database\.db: the disk has 40 MB left and structure from motion needs 4\d"):
+        estimate_poses(corner[0], tmp_path / "out")
+    assert not (tmp_path / "out" / "sparse").exists()
+
+
 @pytest.mark.slow
 def test_poses_are_those_of_the_cameras_up_to_a_similarity(corner, found):
     _, out, registration = found
