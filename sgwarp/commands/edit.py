@@ -82,6 +82,9 @@ class Edit(SceneOptions):
     script: Path | None = None
     """Steps to replay, instead of --select and an operation."""
 
+    undo: int = 0
+    """With --script: leave out so many of its last steps."""
+
     views: Path | None = None
     """Cameras, for click: and for the picture."""
 
@@ -101,6 +104,8 @@ class Edit(SceneOptions):
             raise InputError(f"--out {self.out}: is the scene itself; choose another name")
         if self.view is not None and self.views is None:
             raise InputError(f"--view {self.view}: needs --views, the folder that holds it")
+        if self.undo and self.script is None:
+            raise InputError(f"--undo {self.undo}: needs --script, whose last steps it leaves out")
         if self.encoder is not None and self.semantics is None:
             raise InputError(f"--encoder {self.encoder}: needs --semantics, what `sgwarp lift` wrote for this scene")
         with self.logged(self.out.parent) as log:
@@ -137,7 +142,12 @@ class Edit(SceneOptions):
     def _replayed(self, steps: tuple[EditStep, ...]) -> tuple[EditStep, ...]:
         if self.select or self._operations():
             raise InputError("--script: already says what to do; leave out --select and the operations")
-        return steps
+        if not 0 <= self.undo < len(steps):
+            raise InputError(
+                f"--undo {self.undo}: {self.script} has {len(steps)} steps; leave at least one, before it the scene is "
+                f"{self.scene}"
+            )
+        return steps[: len(steps) - self.undo]
 
     def _steps(self) -> tuple[EditStep, ...]:
         """One step for each operation asked for, all of them applied to the same Gaussians."""

@@ -52,6 +52,9 @@ def files(stage, stage_files, tmp_path_factory):
         ("--select id:1 --remove --encoder conse", "needs --semantics"),
         ("--select lamp --remove --semantics FOLDER/i.safetensors", "holds no lifted semantics"),
         ("--script FOLDER", "is a folder"),
+        ("--script FOLDER/edited.ops.json --undo 1", "has 1 steps; leave at least one"),
+        ("--script FOLDER/edited.ops.json --undo -1", "has 1 steps; leave at least one"),
+        ("--select id:1 --remove --undo 1", "needs --script"),
     ],
 )
 def test_odd_edits(stage_files, files, tmp_path, capsys, options, message):
@@ -62,6 +65,16 @@ def test_odd_edits(stage_files, files, tmp_path, capsys, options, message):
     (line,) = capsys.readouterr().err.strip().splitlines()
     assert message in line
     assert not list(tmp_path.iterdir())
+
+
+def test_undo_leaves_out_the_last_steps(stage_files, tmp_path):
+    box = ["--select", "box:-9,-9,2.9,9,9,3.1"]
+    edit = ["edit", stage_files.scene, "--out"]
+    assert not runs(*edit, tmp_path / "both.ply", *box, "--scale", 2, "--recolor", "red")
+    assert not runs(*edit, tmp_path / "one.ply", *box, "--scale", 2)
+    assert not runs(*edit, tmp_path / "undone.ply", "--script", tmp_path / "both.ops.json", "--undo", 1)
+    assert (tmp_path / "undone.ply").read_bytes() == (tmp_path / "one.ply").read_bytes()
+    assert (tmp_path / "undone.ops.json").read_text() == (tmp_path / "one.ops.json").read_text()
 
 
 @pytest.mark.parametrize("option", ["--semantics FOLDER/s.safetensors", "--instances FOLDER/i.safetensors"])
