@@ -15,6 +15,8 @@ if TYPE_CHECKING:
     from sgwarp.runs.log import RunLog
     from sgwarp.scene import Gaussians, InstanceMap, Semantics, View
 
+LISTED = 15  # instances, the largest
+
 
 @dataclass(kw_only=True)
 class Instances(SceneOptions):
@@ -35,7 +37,7 @@ class Instances(SceneOptions):
     `sgwarp encoders` lists all."""
 
     out: Path
-    """Instances file to write, .safetensors; table.json and run.json go beside it."""
+    """Instances file to write, .safetensors; {out}.table.json and run.json go beside it."""
 
     group: Literal["association", "name"] = "association"
     """association joins masks that show the same Gaussians; name trusts the names or ids of the source: those of a
@@ -101,13 +103,14 @@ class Instances(SceneOptions):
             notes: dict[str, Any] = {"masks": self.masks, "views": len(views), "group": self.group}
             with log.stage("write"):
                 save_instances(found, self.out, notes)
-                table = self.out.with_name("table.json")
+                table = self.out.with_name(f"{self.out.stem}.table.json")
                 save_table(found, table)
             log.outputs += [str(self.out), str(table)]
             log.error["instances"] = len(found.table)
             log.error["bytes_per_gaussian"] = self.out.stat().st_size / len(gaussians)
             self._write_scene(gaussians, found, log)
             self._render(gaussians, views, found, log)
+            print(listing(found))
 
     def _check(self) -> None:
         """Refuse what cannot be written or does not go together, before the work is done."""
@@ -206,3 +209,18 @@ class Instances(SceneOptions):
                     write_rgb(picture, draw_ids(photograph(gaussians, view), ids, found))
                 log.outputs += [str(path), str(picture)]
                 progress(done, len(views), view.stem)
+
+
+def listing(found: InstanceMap) -> str:
+    """The largest instances, a line each."""
+    rows = sorted(found.table, key=lambda row: -row.gaussians)
+    lines = [f"{'id':>5} {'Gaussians':>10} {'views':>6} {'sure':>5}  {'size [scene units]':<22} label"]
+    for row in rows[:LISTED]:
+        size = " x ".join(f"{side:.3g}" for side in row.extent)
+        name = row.label + (f" ({row.label_score:.2f})" if row.label else "")
+        level = "" if row.level == "default" else f" level {row.level}"
+        line = f"{row.id:>5} {row.gaussians:>10,} {row.views:>6} {row.confidence:>5.2f}  {size:<22} {name}{level}"
+        lines.append(line.rstrip())
+    if len(rows) > LISTED:
+        lines.append(f"{len(rows) - LISTED} smaller ones are in the table")
+    return "\n".join(lines)

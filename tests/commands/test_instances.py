@@ -12,7 +12,7 @@ from sgwarp.apps.editing import operations as ops
 from sgwarp.apps.editing.script import EditStep
 from sgwarp.apps.editing.selection import Selection
 from sgwarp.cli import main
-from sgwarp.commands.instances import Instances
+from sgwarp.commands.instances import Instances, listing
 from sgwarp.errors import InputError
 from sgwarp.files.images import read_ids
 from sgwarp.io.instances import load_instances, save_instances
@@ -51,7 +51,7 @@ def found(stage_files, tmp_path_factory):
 def test_instances_writes_what_it_found(stage, stage_files, found):
     instances = load_instances(found, stage_files.gaussians)
     assert len(instances.table) == 4
-    table = json.loads((found.parent / "table.json").read_text())
+    table = json.loads(found.with_suffix(".table.json").read_text())
     assert [row["id"] for row in table["instances"]] == [1, 2, 3, 4]
     run = json.loads((found.parent / "run.json").read_text())
     assert run["error"]["instances"] == 4
@@ -347,3 +347,14 @@ def test_edit_asks_the_encoder_of_its_semantics(stage, stage_files, stopped, toy
         ).positional
         assert context.encoder is toy_text
     assert asked == [("toy", "clip:somewhere", "cpu"), ("toy", "other", "cpu")]
+
+
+def test_the_largest_instances_are_listed(found, monkeypatch):
+    instances = load_instances(found)
+    first, *rows = listing(instances).splitlines()
+    assert first.split()[:4] == ["id", "Gaussians", "views", "sure"]
+    by_size = sorted(instances.table, key=lambda row: row.gaussians, reverse=True)
+    assert [int(row.split()[0]) for row in rows] == [row.id for row in by_size]
+    assert [int(row.split()[1].replace(",", "")) for row in rows] == [row.gaussians for row in by_size]
+    monkeypatch.setattr("sgwarp.commands.instances.LISTED", 3)
+    assert listing(instances).splitlines()[1:] == [*rows[:3], "1 smaller ones are in the table"]

@@ -14,7 +14,7 @@ def find(stage_files, folder, masks: str, *options: str):
     out = folder / "found" / "i.safetensors"
     arguments = [str(stage_files.scene), "--views", str(stage_files.views), "--masks", masks, "--out", str(out)]
     assert main(["instances", *arguments, *options]) == 0
-    return load_instances(out), json.loads((out.parent / "table.json").read_text())["instances"]
+    return load_instances(out), json.loads(out.with_suffix(".table.json").read_text())["instances"]
 
 
 def of_panel(stage, found, level=None) -> list[int]:
