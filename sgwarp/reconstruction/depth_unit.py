@@ -25,6 +25,8 @@ MOST_VIEWS, MOST_POINTS = 10, 250  # whose points are compared, and of each
 REACH, RATIO, FINE_RATIO = 1e5, 1.08, 1.005  # of the factors that are tried, and between two of them
 CLOSE = 0.04  # relative difference of depth that counts as agreement
 NEARLY = 0.95  # of the best agreement, from which on a factor is as good, and a round one is meant
+STAYS = 0.75  # of the best agreement, from which on depth stays as given: at huge factors parallax is lost, and what
+# contradicts the views with it; depth in a wrong unit has less than 0.3
 LEAST_POINTS = 200  # that fall into other views, to say anything
 
 
@@ -71,8 +73,8 @@ def measure_depth_unit(depths: Sequence[Array], cameras: Sequence[Camera], exten
     factor, most = _widest(pairs, np.exp(np.arange(-math.log(REACH), math.log(REACH), math.log(RATIO))))
     factor, fine = _widest(pairs, factor * FINE_RATIO ** np.arange(-20.0, 21.0))
     most = max(most, fine)
-    for simple in (1.0, 10.0 ** round(math.log10(factor))):
-        if (agreement := pairs.agreement(simple)) >= NEARLY * most:
+    for simple, least in ((1.0, STAYS), (10.0 ** round(math.log10(factor)), NEARLY)):
+        if (agreement := pairs.agreement(simple)) >= least * most:
             return DepthUnit(simple, agreement, as_given)
     return DepthUnit(factor, pairs.agreement(factor), as_given)
 
