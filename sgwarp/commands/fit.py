@@ -90,6 +90,9 @@ class Fit(Options):
     """Folder of {stem}.png, or of folders and names as the photographs'; what is black there does not count. If not
     given, the masks that the data set names; none for none at all."""
 
+    mask_hides: Literal["black", "white"] = "black"
+    """What the masks of --masks leave out."""
+
     exposure: bool = False
     """Also fit an affine map of the colours for every photograph."""
 
@@ -213,7 +216,7 @@ class Fit(Options):
 
         if self.masks is None:
             return masks_of_views(views)
-        return None if str(self.masks) == "none" else masks_from_folder(self.masks, views)
+        return None if str(self.masks) == "none" else masks_from_folder(self.masks, views, self.mask_hides)
 
     def _posed(self, log: RunLog) -> Path:
         """The data set: what was given, or what structure from motion makes of it."""

@@ -200,7 +200,9 @@ def place_views(gaussians: Gaussians, scene: Path, views: list[View], transform:
     """
     from sgwarp.io.world_transforms import moved_views
     from sgwarp.rendering.agreement import find_placement
+    from sgwarp.scene.extent import with_near_plane_of
 
+    views = with_near_plane_of(views, gaussians)
     matrix = find_placement(gaussians, scene, views, transform)
     return views if matrix is None else moved_views(views, matrix)
 

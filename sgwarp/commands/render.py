@@ -91,6 +91,7 @@ class Render(SceneOptions):
         """The views in the world of the scene; compared with their photographs, if these are there."""
         from sgwarp.io.world_transforms import moved_views
         from sgwarp.rendering.agreement import find_placement
+        from sgwarp.scene.extent import with_near_plane_of
 
         assert self.views is not None
         try:
@@ -98,6 +99,7 @@ class Render(SceneOptions):
                 compared = find_views(self.views, self.view, images=self.images)
         except InputError:
             compared = views
+        views, compared = (with_near_plane_of(group, gaussians) for group in (views, compared))
         matrix = find_placement(gaussians, self.scene, compared, self.transform)
         return views if matrix is None else moved_views(views, matrix)
 

@@ -18,6 +18,7 @@ from sgwarp.files.image_headers import (
     JPEG_SIGNATURE,
     PNG_SIGNATURE,
     START_OF_SCAN,
+    TIFF_SIGNATURES,
     check_image,
     image_size,
     jpeg_segments,
@@ -26,7 +27,7 @@ from sgwarp.files.image_headers import (
 )
 
 HEADER_BYTES = 1 << 18
-ALPHA_SUFFIXES = (".png", ".webp", ".tif", ".tiff")
+WITH_ALPHA = (b"\x89PNG", b"RIFF", *TIFF_SIGNATURES)  # first bytes, whatever the name ends in
 RGB_SUFFIXES = (".png", ".jpg", ".jpeg")
 
 
@@ -41,7 +42,11 @@ def read_rgb(path: str | os.PathLike[str]) -> NDArray[np.uint8]:
     """
     import cv2
 
-    pixels = _decode(path, read_bytes(path), cv2.IMREAD_COLOR | cv2.IMREAD_IGNORE_ORIENTATION)
+    data = read_bytes(path)
+    pixels = _decode(path, data, cv2.IMREAD_COLOR | cv2.IMREAD_IGNORE_ORIENTATION)
+    if data[:4] in TIFF_SIGNATURES and (alpha := _alpha(path, data)) is not None:
+        # The decoder multiplies colors by alpha, as it does of no other format.
+        pixels = (pixels * (255 / np.maximum(alpha, 1.0))[:, :, None] + 0.5).clip(0, 255).astype(np.uint8)
     return np.ascontiguousarray(pixels[:, :, ::-1])
 
 
@@ -51,11 +56,16 @@ def read_alpha(path: str | os.PathLike[str]) -> NDArray[np.uint8] | None:
     Raises:
         InputError: The file is missing, cut short, or not an image.
     """
+    with open_input(path) as file:
+        if not file.read(4).startswith(WITH_ALPHA):
+            return None
+    return _alpha(path, read_bytes(path))
+
+
+def _alpha(path: str | os.PathLike[str], data: bytes) -> NDArray[np.uint8] | None:
     import cv2
 
-    if Path(path).suffix.lower() not in ALPHA_SUFFIXES:
-        return None
-    pixels = _decode(path, read_bytes(path), cv2.IMREAD_UNCHANGED | cv2.IMREAD_IGNORE_ORIENTATION)
+    pixels = _decode(path, data, cv2.IMREAD_UNCHANGED | cv2.IMREAD_IGNORE_ORIENTATION)
     if pixels.ndim != 3 or pixels.shape[2] != 4:
         return None
     alpha = pixels[:, :, 3] if pixels.dtype == np.uint8 else (pixels[:, :, 3] >> 8).astype(np.uint8)
@@ -112,6 +122,17 @@ def read_ids(path: str | os.PathLike[str]) -> NDArray[np.int32]:
         return red if grey else red + 256 * green + 65536 * blue
     # The decoder spreads 1, 2 and 4 bits over 0..255.
     return pixels.astype(np.int32) // (255 // ((1 << bits) - 1) if bits < 8 else 1)
+
+
+def read_values(path: str | os.PathLike[str]) -> NDArray[Any]:
+    """The numbers of an image as they are stored, [H, W] or [H, W, C] of its type, such as depth in a TIFF file.
+
+    Raises:
+        InputError: The file is missing, cut short, or not an image.
+    """
+    import cv2
+
+    return _decode(path, read_bytes(path), cv2.IMREAD_UNCHANGED | cv2.IMREAD_IGNORE_ORIENTATION)
 
 
 def write_rgb(path: str | os.PathLike[str], image: Any) -> None:

@@ -15,14 +15,13 @@ from sgwarp.files.exif import UPRIGHT
 from sgwarp.io.colmap_model import ImageRecord, count_images, find_model, find_models, read_cameras, read_images
 from sgwarp.io.colmap_model import read_points as read_points
 from sgwarp.io.image_folders import find_image_folder
-from sgwarp.io.names import inside
 from sgwarp.io.photograph_files import PhotographFiles
 from sgwarp.io.photographs import LeftOut, fit_photograph, say_orientations
 from sgwarp.io.stems import unique_stems
 from sgwarp.io.undistort import Lens, Listed, pinhole_view
 from sgwarp.scene import View
 
-MISSING, UNPOSED = "without photograph", "whose pose holds NaN or infinity"
+MISSING, UNPOSED, TWICE = "without photograph", "whose pose holds NaN or infinity", "that are listed before"
 
 
 def read_colmap(path: str | os.PathLike[str], image_folder: str | None = None, photographs: bool = True) -> list[View]:
@@ -52,8 +51,15 @@ def read_colmap(path: str | os.PathLike[str], image_folder: str | None = None, p
     records = read_images(model)
     folder = find_image_folder(model, [record.name for record in records], image_folder) if photographs else None
     left_out, files = LeftOut(model, "images"), PhotographFiles(model, (record.name for record in records))
-    found = {r.name: files.find(inside(model, folder, r.name)) if folder is not None else None for r in records}
-    kept = [r for r in records if _usable(r, lenses, folder is None or found[r.name] is not None, left_out)]
+    found = {r.name: files.locate(folder, r.name) if folder is not None else None for r in records}
+    kept, seen = [], set[Path | str]()
+    for record in records:
+        own = found[record.name] or record.name
+        if own in seen:
+            left_out.add(TWICE, record.name)
+        elif _usable(record, lenses, folder is None or found[record.name] is not None, left_out):
+            seen.add(own)
+            kept.append(record)
     views, used = [], []
     for stem, record in zip(unique_stems(model, [record.name for record in kept]), kept, strict=True):
         image = found[record.name]
@@ -83,16 +89,10 @@ def read_colmap(path: str | os.PathLike[str], image_folder: str | None = None, p
 
 
 def _usable(record: ImageRecord, lenses: dict[int, Lens | InputError], exists: bool, left_out: LeftOut) -> bool:
-    """Whether an image has a camera, a pose and a photograph; if not, why is noted.
-
-    Raises:
-        InputError: It refers to a camera that is not listed.
-    """
-    if record.camera_id not in lenses:
-        raise InputError(
-            f"{left_out.source}: image {record.name!r} refers to camera {record.camera_id}, which is not listed"
-        )
-    lens = lenses[record.camera_id]
+    """Whether an image has a camera, a pose and a photograph; if not, why is noted."""
+    lens = lenses.get(record.camera_id) or InputError(
+        f"{left_out.source}: image {record.name!r} refers to camera {record.camera_id}, which is not listed"
+    )
     if not exists:
         left_out.add(MISSING, record.name)
     elif _world_to_camera(record) is None:

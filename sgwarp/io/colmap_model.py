@@ -102,6 +102,11 @@ def find_models(folder: Path) -> list[Path]:
     return []
 
 
+def holds_model(folder: Path) -> bool:
+    """Whether a folder is a sparse model."""
+    return _holds(folder, "cameras")
+
+
 def count_images(model: Path) -> int:
     """How many images a model says it holds, at most what its file has room for; 0 if it has none."""
     for suffix in (".bin", ".txt"):

@@ -17,6 +17,7 @@ from __future__ import annotations
 import os
 from collections import Counter
 from collections.abc import Iterator, Sequence
+from itertools import product
 from pathlib import Path, PurePosixPath
 
 from sgwarp.errors import InputError
@@ -48,11 +49,17 @@ class Companions:
             self._folded.setdefault(name.lower(), []).append(path)
         self._tails = Counter(tail.lower() for view in views for tail in set(_tails(view)))
 
-    def find(self, view: View, endings: Sequence[str]) -> list[Path]:
-        """The files of a view, at most one for each ending, in the order of the endings."""
+    @property
+    def paths(self) -> list[Path]:
+        """All files of the folder."""
+        return list(self._files.values())
+
+    def find(self, view: View, endings: Sequence[str], beginnings: Sequence[str] = ("",)) -> list[Path]:
+        """The files of a view, at most one for each beginning and ending of names, in their order."""
         found = []
-        for ending in endings:
-            path = next((path for name in self._names(view, ending) if (path := self._lookup(name))), None)
+        for beginning, ending in product(beginnings, endings):
+            names = (_begun(name, beginning) for name in self._names(view, ending))
+            path = next((path for name in names if (path := self._lookup(name))), None)
             if path is not None and path not in found:
                 found.append(path)
         return found
@@ -87,9 +94,16 @@ def _files(folder: Path) -> Iterator[tuple[str, Path]]:
 
 def _tails(view: View) -> Iterator[str]:
     """The photograph's path as its data set lists it, then without its first folder, and so on."""
-    parts = [part for part in PurePosixPath(view.name or view.stem).parts if part not in ("..", ".", "/")]
+    path = PurePosixPath((view.name or view.stem).replace("\\", "/"))
+    parts = [part for part in path.parts if part not in ("..", ".", "/")]
     for start in range(len(parts)):
         yield "/".join(parts[start:])
+
+
+def _begun(name: str, beginning: str) -> str:
+    """The name with something before its last part."""
+    folder, slash, last = name.rpartition("/")
+    return f"{folder}{slash}{beginning}{last}"
 
 
 def _without_suffix(name: str) -> str:

@@ -37,6 +37,12 @@ CAPTURES = (
 LISTS = (
     ("*.log", rb"\A\s*\d+\s+\d+\s+\d+\s*\n", "a list of Tanks and Temples poses (.log)", "to a transforms.json"),
     ("*.xml", rb"<chunk|<cameras", "Metashape's list of cameras (.xml)", "its COLMAP export, or ns-process-data"),
+    (
+        "cameras.json",
+        rb"img_name",
+        "the list of cameras of a 3DGS trainer's output (cameras.json)",
+        "give the data set that it was trained on, which cfg_args names as source_path",
+    ),
     ("*.csv", rb"\A#name", "RealityCapture's list of cameras (.csv)", "its COLMAP export, or ns-process-data"),
 )
 HEAD_BYTES = 4096
@@ -66,6 +72,8 @@ def describe_capture(folder: Path) -> str | None:
 
 
 def _not_read(what: str, remedy: str) -> str:
+    if remedy.startswith("give "):
+        return f"holds {what}, which is not read; {remedy}"
     return f"holds {what}, which is not read; convert it ({remedy}), or find poses anew (sgwarp poses)"
 
 

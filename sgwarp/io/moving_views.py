@@ -18,6 +18,7 @@ from sgwarp.io.stems import IMAGE_SUFFIXES
 from sgwarp.io.views import TRANSFORMS, load_views
 from sgwarp.io.world_transforms import moved_views
 from sgwarp.scene import Camera, View
+from sgwarp.scene.extent import with_near_plane
 
 Split = Literal["train", "test"]
 IMAGES = "ims"  # folder beside the meta files that holds the photographs
@@ -149,6 +150,7 @@ class MetaViews:
         if not self._frames:
             raise InputError(f"{path}: 'w2c' has no frames")
         self._images = path.parent / IMAGES
+        self._near: tuple[float, float] | None = None
 
     def _pixels(self, meta: dict[str, Any], name: str) -> int:
         value = meta[name]
@@ -181,7 +183,17 @@ class MetaViews:
             there = image is not None and os.path.isfile(image)
             view = View(stem, self._camera(where, lens, pose), image if there else None)
             found.append(FrameView(view, file, image is not None and not there and self._images.is_dir()))
-        return found
+        return self._with_near_planes(found)
+
+    def _with_near_planes(self, found: list[FrameView]) -> list[FrameView]:
+        """The cameras with near and far planes that fit the unit of the first ones that were asked for."""
+        if self._near is None and found:
+            camera = with_near_plane([one.view for one in found])[0].camera
+            self._near = camera.near, camera.far
+        near, far = self._near or (Camera.near, Camera.far)
+        return [
+            replace(one, view=replace(one.view, camera=replace(one.view.camera, near=near, far=far))) for one in found
+        ]
 
     def _of(self, name: str, frame: int, count: int) -> list[Any]:
         rows = self._meta.get(name)

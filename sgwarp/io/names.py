@@ -4,12 +4,15 @@ from __future__ import annotations
 
 import logging
 import os
+from collections.abc import Iterator
 from contextlib import suppress
 from pathlib import Path, PurePosixPath
+from urllib.parse import unquote
 
 from sgwarp.errors import InputError
 
 VARIABLE = "SGWARP_OUTSIDE"
+ADDRESS = "file://"
 
 
 def inside(source: str | os.PathLike[str], folder: Path, name: str) -> Path:
@@ -38,3 +41,35 @@ def inside(source: str | os.PathLike[str], folder: Path, name: str) -> Path:
             )
         logging.getLogger("sgwarp").warning("%s: %r lies outside the data set, and is read", source, name)
     return folder / path
+
+
+def spellings(name: str) -> Iterator[str]:
+    """A listed name, and the file name that it stands for where it was written as an address."""
+    yield name
+    plain = name[len(ADDRESS) :] if name.startswith(ADDRESS) else name
+    if "%" in plain:
+        plain = unquote(plain)
+    if plain != name:
+        yield plain
+
+
+def tails(name: str) -> Iterator[str]:
+    """What may be left of a name in another folder than it was written for: ever fewer of its folders."""
+    *_, plain = spellings(name)
+    parts = [part for part in plain.strip().replace("\\", "/").split("/") if part not in ("", ".", "..")]
+    if parts and parts[0].endswith(":"):  # a drive
+        parts = parts[1:]
+    for start in range(len(parts)):
+        yield "/".join(parts[start:])
+
+
+def find_named(source: str | os.PathLike[str], folder: Path, name: str) -> Path | None:
+    """The file that a data set calls `name`, or, where it was moved since, the end of that path; None without one.
+
+    A name that leads out of the data set is as one that does not exist.
+    """
+    for spelling in spellings(name):
+        with suppress(InputError):
+            if os.path.isfile(path := inside(source, folder, spelling)):
+                return path
+    return next((folder / tail for tail in tails(name) if os.path.isfile(folder / tail)), None)

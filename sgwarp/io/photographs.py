@@ -11,6 +11,8 @@ from sgwarp.files.exif import NAMES, UPRIGHT, read_orientation
 from sgwarp.files.images import read_size
 from sgwarp.io.undistort import Lens
 
+LARGE = 200  # pixels, of which one more or less does not matter
+
 
 class LeftOut:
     """Photographs that cannot be used, and why: said once per reason, and an error only if none is left."""
@@ -69,8 +71,10 @@ def fit_photograph(lens: Lens, path: Path) -> tuple[Lens, int]:
         if (w, h) == (lens.width, lens.height):
             return lens, way
     for w, h, way in ways:
-        # Tools round the smaller size up or down.
-        if max(abs(lens.height * w / lens.width - h), abs(lens.width * h / lens.height - w)) < 1:
+        # Tools round the smaller size up or down; encoders of videos leave out an odd row or column.
+        rounded = max(abs(lens.height * w / lens.width - h), abs(lens.width * h / lens.height - w)) < 1
+        odd = max(abs(lens.width - w), abs(lens.height - h)) <= 1 and min(w, h) >= LARGE
+        if rounded or odd:
             return lens.resized(w, h), way
     noted = ""
     if orientation != UPRIGHT:

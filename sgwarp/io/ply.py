@@ -252,7 +252,7 @@ def build_gaussians(
 ) -> Gaussians:
     """Gaussians from arrays in the order of its fields; says how many rows are not finite."""
     means, quats, scales, opacities, sh = (
-        torch.from_numpy(np.ascontiguousarray(field, np.float32)) for field in fields
+        torch.from_numpy(np.require(field, np.float32, ("C", "W"))) for field in fields
     )
     gaussians = Gaussians(means, quats, scales, opacities, sh, extras)
     if gaussians.non_finite:

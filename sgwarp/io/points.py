@@ -12,13 +12,14 @@ from numpy.typing import NDArray
 
 from sgwarp.errors import InputError
 from sgwarp.files.documents import read_json
-from sgwarp.io.colmap_model import find_model, read_points
+from sgwarp.io.colmap_model import find_model, holds_model, read_points
 from sgwarp.io.colors import rgb_names, unit_colors
-from sgwarp.io.names import inside
+from sgwarp.io.names import find_named, inside
 from sgwarp.io.ply import COLOUR, POSITION, columns, read_elements
 from sgwarp.io.world import apply_transform, camera_places, far_origin, transform_of_points
 
 PLY_NAMES = ("points3D.ply", "sparse_pc.ply", "point_cloud.ply")  # beside a transforms.json that names none
+MODEL_NAMES = ("points3D.bin", "points3D.txt")  # of a COLMAP model; 3DGS trainers leave a points3D.ply beside them
 PLY_KEY = "ply_file_path"  # of nerfstudio's transforms.json
 GREY = 0.5
 SH_C0 = 0.28209479177387814  # constant of degree 0: color = SH_C0 f_dc + 0.5
@@ -70,7 +71,8 @@ def _placed(source: Path, data_set: Path, positions: NDArray[np.float64]) -> NDA
     if data_set.is_file() and data_set.suffix.lower() != ".json":
         return positions
     transforms = data_set if data_set.is_file() else data_set / "transforms.json"
-    if transforms.is_file() and source.suffix.lower() != ".ply":
+    of_model = source.suffix.lower() != ".ply" or (source.parent != transforms.parent and holds_model(source.parent))
+    if transforms.is_file() and of_model:
         matrix = transform_of_points(transforms, read_json(transforms), source.parent)
         if matrix is None:
             raise InputError(f"{source}: its points do not belong to {transforms}; name others, or start without any")
@@ -96,7 +98,7 @@ def find_points(path: str | os.PathLike[str]) -> Path | None:
     model = find_model(folder)
     if model is None:
         return None
-    return next((model / name for name in ("points3D.bin", "points3D.txt") if (model / name).is_file()), None)
+    return next((model / name for name in (*MODEL_NAMES, PLY_NAMES[0]) if (model / name).is_file()), None)
 
 
 def _named_in(transforms: Path) -> Path | None:
@@ -109,8 +111,9 @@ def _named_in(transforms: Path) -> Path | None:
         return None
     if not isinstance(name, str):
         raise InputError(f"{transforms}: '{PLY_KEY}' must be the name of a file, got {name!r}")
-    named = inside(transforms, transforms.parent, name)
-    if not os.path.isfile(named):  # any name will do here, also one that is too long
+    named = find_named(transforms, transforms.parent, name)
+    if named is None:
+        inside(transforms, transforms.parent, name)  # or else it leads out of the data set
         logging.getLogger("sgwarp").warning("%s: its '%s' %r does not exist", transforms, PLY_KEY, name)
         return None
     return named

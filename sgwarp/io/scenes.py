@@ -64,6 +64,7 @@ SPLAT = SceneFormat(".splat", (".splat",), PLY_AXES, read_splat, write_splat)
 GLTF = SceneFormat("glTF", (".glb", ".gltf"), GLTF_AXES, read_gltf, write_gltf)
 SOG = SceneFormat("SOG", (".sog", "meta.json"), PLY_AXES, read_sog)
 FORMATS = (COMPRESSED, PLY, SPZ, SPLAT, GLTF, SOG)
+SCENE_SUFFIXES = tuple(suffix for form in FORMATS for suffix in form.suffixes)
 WRITTEN = ", ".join(suffix for form in FORMATS if form.write for suffix in form.suffixes if suffix != ".gltf")
 
 
@@ -92,6 +93,8 @@ def find_format(path: str | os.PathLike[str]) -> SceneFormat:
     """
     if os.path.isdir(path) and os.path.isfile(os.path.join(path, "meta.json")):
         return SOG
+    if os.path.isdir(path) and (held := _scene_in(Path(path))):
+        raise InputError(f"{path}: is a folder; give its scene, {held}")
     with reading(path), open(path, "rb") as file:
         head = file.read(HEAD_BYTES)
     if head[:4] == b"ply\n" or head[:4] == b"ply\r" or head[:3] == b"ply":
@@ -114,6 +117,15 @@ def find_format(path: str | os.PathLike[str]) -> SceneFormat:
     raise InputError(
         f"{path}: is not a valid PLY file, nor a scene of another format that is read ({_read_suffixes()})"
     )
+
+
+def _scene_in(folder: Path) -> Path | None:
+    """The scene in a folder: the last one that a 3DGS trainer left, or the only file that is named like one."""
+    trained = list(folder.glob("point_cloud/iteration_*/point_cloud.ply"))
+    if trained:
+        return max(trained, key=lambda path: (len(path.parent.name), path.parent.name))
+    named = [path for path in folder.iterdir() if path.name.lower().endswith(SCENE_SUFFIXES) and path.is_file()]
+    return named[0] if len(named) == 1 else None
 
 
 def _read_suffixes() -> str:

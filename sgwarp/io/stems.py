@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+from collections import Counter
 from collections.abc import Sequence
 from pathlib import PurePath, PurePosixPath
 
@@ -20,8 +21,9 @@ def is_image_name(path: PurePath) -> bool:
 def unique_stems(source: str | os.PathLike[str], names: Sequence[str]) -> list[str]:
     """One stem per listed photograph: its file name without extension.
 
-    Where two photographs share it (a/0.png and b/0.png), all of them are named by their whole relative path instead,
-    joined by underscores (a_0, b_0).
+    Where two photographs share it in different folders (a/0.png and b/0.png), all of them are named by their whole
+    relative path instead, joined by underscores (a_0, b_0). Where they differ in the extension alone (0.png and 0.jpg),
+    these two keep it.
 
     Args:
         source: The file that lists them, for the message.
@@ -30,10 +32,15 @@ def unique_stems(source: str | os.PathLike[str], names: Sequence[str]) -> list[s
     Raises:
         InputError: Two photographs have the same name even so.
     """
+    whole = [PurePosixPath(name.replace("\\", "/")) for name in names]
     paths = [_without_extension(name) for name in names]
-    stems = [path.name for path in paths]
-    if len(set(stems)) < len(stems):
-        stems = ["_".join(part for part in path.parts if part not in ("..", "/")) for path in paths]
+    ways = (
+        [path.name for path in paths],
+        _joined(paths),
+        _with_endings([path.name for path in paths], [path.name for path in whole]),
+        _with_endings(_joined(paths), _joined(whole)),
+    )
+    stems = next((way for way in ways if len(set(way)) == len(way)), ways[-1])
     first: dict[str, int] = {}
     for index, stem in enumerate(stems):
         if stem in first:
@@ -42,6 +49,16 @@ def unique_stems(source: str | os.PathLike[str], names: Sequence[str]) -> list[s
             )
         first[stem] = index
     return stems
+
+
+def _joined(paths: Sequence[PurePosixPath]) -> list[str]:
+    return ["_".join(part for part in path.parts if part not in ("..", "/")) for path in paths]
+
+
+def _with_endings(stems: Sequence[str], names: Sequence[str]) -> list[str]:
+    """The stems, but the names where others have the same stem."""
+    counts = Counter(stems)
+    return [name if counts[stem] > 1 else stem for stem, name in zip(stems, names, strict=True)]
 
 
 def _without_extension(name: str) -> PurePosixPath:

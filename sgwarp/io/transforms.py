@@ -14,10 +14,10 @@ from numpy.typing import NDArray
 
 from sgwarp.errors import InputError
 from sgwarp.files.documents import read_json
-from sgwarp.files.exif import UPRIGHT
+from sgwarp.files.exif import UPRIGHT, read_orientation
 from sgwarp.files.images import read_size
 from sgwarp.io.lens_models import COLMAP_MODELS, PANORAMA, PANORAMA_REMEDY, LensModel
-from sgwarp.io.names import inside
+from sgwarp.io.names import find_named
 from sgwarp.io.photograph_files import PhotographFiles
 from sgwarp.io.photographs import LeftOut, fit_photograph, say_orientations
 from sgwarp.io.stems import unique_stems
@@ -34,8 +34,9 @@ COEFFICIENTS: dict[LensModel, tuple[str, ...]] = {
     "division": ("k",),
     "eucm": ("alpha", "beta"),
 }
+FOCAL_LENGTHS = (("fl_x", "camera_angle_x", "x_fov"), ("fl_y", "camera_angle_y", "y_fov"))  # pixels, radians, degrees
 RATIONAL = ("k4", "k5", "k6")  # of FULL_OPENCV alone
-MISSING, UNPOSED = "without photograph", "whose pose holds NaN or infinity"
+MISSING, UNPOSED, TWICE = "without photograph", "whose pose holds NaN or infinity", "that are listed before"
 DEPTH_UNIT, MILLIMETER = "depth_unit_scale_factor", 1e-3
 BELONGINGS = ("mask_path", "depth_file_path")
 IGNORED = (
@@ -78,15 +79,21 @@ def read_transforms(path: str | os.PathLike[str], photographs: bool = True) -> l
     left_out = LeftOut(path, "frames")
     files = PhotographFiles(path, (f.get("file_path") for f in meta["frames"] if isinstance(f, dict)))
     kept: list[tuple[int, Fields, NDArray[np.float64], Path | None]] = []
+    seen: set[Path | str] = set()
     _refuse_other_lenses(path, meta)
     for index, frame in enumerate(meta["frames"]):
         where = f"{path}: frame {index}"
         name = frame.get("file_path") if isinstance(frame, dict) else None
         if not isinstance(name, str) or not name:
-            raise InputError(f"{where}: has no 'file_path'; name the photograph it belongs to")
-        image = files.find(inside(path, path.parent, name)) if photographs else None
+            error = InputError(f"{where}: has no 'file_path'; name the photograph it belongs to")
+            left_out.fail(error, f"frame {index}")
+            continue
+        image = files.locate(path.parent, name) if photographs else None
         if photographs and image is None:
             left_out.add(MISSING, name)
+            continue
+        if (image or name) in seen:
+            left_out.add(TWICE, name)
             continue
         try:
             pose = _world_to_camera(f"{where} ({name})", frame.get("transform_matrix"))
@@ -96,6 +103,7 @@ def read_transforms(path: str | os.PathLike[str], photographs: bool = True) -> l
         if pose is None:
             left_out.add(UNPOSED, name)
         else:
+            seen.add(image or name)
             kept.append((index, frame, pose, image))
     stems = unique_stems(path, [frame["file_path"] for _, frame, _, _ in kept])
     views, used = [], []
@@ -129,19 +137,35 @@ def _view(
     """The view of a frame, and the EXIF orientation that its photograph has to be turned by."""
     name = frame["file_path"]
     where = f"{path}: frame {index} ({name})"
-    sized = all(key in frame or key in meta for key in ("w", "h"))
-    lens, orientation = (
-        _lens(where, frame, meta, read_size(image) if image is not None and not sized else None),
-        UPRIGHT,
-    )
+    sized = all(frame.get(key, meta.get(key)) is not None for key in ("w", "h"))
+    size, orientation = (None, UPRIGHT)
+    if image is not None and not sized:
+        size, orientation = _size_of(image, frame, meta)
+    lens = _lens(where, frame, meta, size)
     if image is not None and sized:
         lens, orientation = fit_photograph(lens, image)
     mask, depth = (_belonging(path, frame, key) for key in BELONGINGS)
-    unit = frame.get(DEPTH_UNIT, meta.get(DEPTH_UNIT, MILLIMETER))
-    if isinstance(unit, bool) or not isinstance(unit, (int, float)) or not 0 < unit < MAX_NUMBER:
-        raise InputError(f"{where}: '{DEPTH_UNIT}' must be a positive number of meters, got {unit!r}")
-    listed = Listed(name, image, orientation, mask, depth, float(unit))
+    units = [source[DEPTH_UNIT] for source in (frame, meta) if source.get(DEPTH_UNIT) is not None]
+    unit = _number(where, DEPTH_UNIT, units[0] if units else MILLIMETER)
+    if not unit > 0:
+        raise InputError(f"{where}: '{DEPTH_UNIT}' must be a positive number of meters, got {unit:g}")
+    listed = Listed(name, image, orientation, mask, depth, unit)
     return pinhole_view(where, stem, lens, pose, listed), orientation
+
+
+def _size_of(image: Path, frame: Fields, meta: Fields) -> tuple[tuple[int, int], int]:
+    """(height, width) of a photograph whose camera gives none, and the EXIF orientation that it has to be turned by.
+
+    One that lies sideways is turned if the principal point is nearer to the middle of the upright one.
+    """
+    height, width = read_size(image)
+    orientation = read_orientation(image)
+    middle = [frame.get(key, meta.get(key)) for key in ("cx", "cy")]
+    if orientation >= 5 and all(isinstance(value, (int, float)) for value in middle):
+        lying, upright = (math.dist(middle, (w / 2, h / 2)) for w, h in ((width, height), (height, width)))
+        if upright < lying:
+            return (width, height), orientation
+    return (height, width), UPRIGHT
 
 
 def _belonging(path: Path, frame: Fields, key: str) -> Path | None:
@@ -149,25 +173,22 @@ def _belonging(path: Path, frame: Fields, key: str) -> Path | None:
     name = frame.get(key)
     if not isinstance(name, str) or not name:
         return None
-    try:
-        file = inside(path, path.parent, name)
-    except InputError:  # outside the data set: as if it were not there
-        return None
-    return file if os.path.isfile(file) else None
+    return find_named(path, path.parent, name)
 
 
 def _say_ignored(path: Path, meta: Fields) -> None:
     """Log what the file declares and nothing here reads, and files that it names and that do not exist."""
+    frames = [frame for frame in meta["frames"] if isinstance(frame, dict)]
     for key in BELONGINGS:
-        named = [frame[key] for frame in meta["frames"] if frame.get(key)]
-        absent = [frame[key] for frame in meta["frames"] if frame.get(key) and _belonging(path, frame, key) is None]
+        named = [frame[key] for frame in frames if frame.get(key)]
+        absent = [frame[key] for frame in frames if frame.get(key) and _belonging(path, frame, key) is None]
         if absent:
             logging.getLogger("sgwarp").warning(
                 "%s: %d of %d files that its frames name as %s do not exist, first %s",
                 *(path, len(absent), len(named), key, absent[0]),
             )
     ignored = [key for key in IGNORED if _says(meta.get(key))]
-    ignored += [f"{key} of the frames" for key in IGNORED if any(_says(frame.get(key)) for frame in meta["frames"])]
+    ignored += [f"{key} of the frames" for key in IGNORED if any(_says(frame.get(key)) for frame in frames)]
     beside = [name for name in SPLITS if path.name == "transforms_train.json" and (path.parent / name).is_file()]
     if beside:
         logging.getLogger("sgwarp").info("%s: is read alone; give %s by name to read that", path, " or ".join(beside))
@@ -225,6 +246,17 @@ def _world_to_camera(where: str, matrix: Any) -> NDArray[np.float64] | None:
     return w2c
 
 
+def _number(where: str, key: str, value: Any) -> float:
+    """A number, which some tools write in quotes."""
+    try:
+        number = math.nan if isinstance(value, (bool, list, dict)) or value is None else float(value)
+    except (OverflowError, ValueError):
+        number = math.nan
+    if not abs(number) <= MAX_NUMBER:
+        raise InputError(f"{where}: '{key}' must be a number, got {value!r}")
+    return number
+
+
 def _lens(where: str, frame: Fields, meta: Fields, size: tuple[int, int] | None) -> Lens:
     """Intrinsics of one frame; `size` is (height, width) of the photographs where the file does not say."""
 
@@ -232,11 +264,8 @@ def _lens(where: str, frame: Fields, meta: Fields, size: tuple[int, int] | None)
         """First of `keys` that the frame has, or else the file as a whole."""
         for source in (frame, meta):
             for key in keys:
-                if key in source:
-                    value = source[key]
-                    if isinstance(value, bool) or not isinstance(value, (int, float)) or abs(value) > MAX_NUMBER:
-                        raise InputError(f"{where}: '{key}' must be a number, got {value!r}")
-                    return key, float(value)
+                if source.get(key) is not None:
+                    return key, _number(where, key, source[key])
         return None
 
     def pixels(key: str, default: int | None) -> int:
@@ -250,11 +279,16 @@ def _lens(where: str, frame: Fields, meta: Fields, size: tuple[int, int] | None)
 
     def focal(found: tuple[str, float], extent: int) -> float:
         key, value = found
-        if not key.startswith("camera_angle"):
+        if key.startswith("fl_"):
             return value
-        if not 0 < value < math.pi:
-            raise InputError(f"{where}: '{key}' must be a field of view in radians between 0 and pi, got {value:g}")
-        return 0.5 * extent / math.tan(0.5 * value)
+        degrees = key.endswith("_fov")
+        angle = math.radians(value) if degrees else value
+        if not 0 < angle < math.pi:
+            unit, other = ("degrees between 0 and 180", "") if degrees else ("radians between 0 and pi", "")
+            if not degrees and math.pi < value < 180:
+                other = f"; if these are degrees, name it '{key[-1]}_fov'"
+            raise InputError(f"{where}: '{key}' must be a field of view in {unit}, got {value:g}{other}")
+        return 0.5 * extent / math.tan(0.5 * angle)
 
     model = frame.get("camera_model", meta.get("camera_model", "OPENCV"))
     name = model.upper() if isinstance(model, str) else ""
@@ -274,13 +308,19 @@ def _lens(where: str, frame: Fields, meta: Fields, size: tuple[int, int] | None)
                 raise InputError(f"{where}: '{key}' is not defined for camera_model {model}; correct the camera model")
         distortion = distortion[: -len(RATIONAL)]
     height, width = (pixels(key, size[i] if size else None) for i, key in enumerate(("h", "w")))
-    horizontal = number("fl_x", "camera_angle_x") or number("fl_y", "camera_angle_y")
+    across, down = FOCAL_LENGTHS
+    horizontal = number(*across) or number(*down)
     if horizontal is None:
         raise InputError(f"{where}: has no focal length ('fl_x' in pixels or 'camera_angle_x' in radians)")
-    fx = focal(horizontal, height if horizontal[0] == "camera_angle_y" else width)
-    vertical = number("fl_y", "camera_angle_y")
+    fx = focal(horizontal, height if horizontal[0] in down else width)
+    vertical = number(*down)
     fy = focal(vertical, height) if vertical else fx
     cx, cy = number("cx"), number("cy")
+    if size and cx and cy and not any(0.25 < c[1] / extent < 0.75 for c, extent in ((cx, width), (cy, height))):
+        raise InputError(
+            f"{where}: has no 'w' and 'h', and its photograph is {width} x {height}, while 'cx' and 'cy' are the "
+            f"middle of one of about {2 * cx[1]:.0f} x {2 * cy[1]:.0f}; add the size that the numbers are meant for"
+        )
     try:
         return Lens(fx, fy, cx[1] if cx else width / 2, cy[1] if cy else height / 2, width, height, distortion, kind)
     except InputError as error:

@@ -21,6 +21,7 @@ from sgwarp.scene.camera import MOST_PIXELS
 
 ZOOM_RANGE = (0.5, 4.0)
 EDGE = 1e-6  # [pixels]
+LEAST_FOCAL = 0.05  # of a perspective lens [sizes of the image]
 ROWS = 256  # of an image, for which sampling positions are found at a time
 
 
@@ -145,6 +146,23 @@ def same_shape(small: Sequence[int], size: Sequence[int]) -> bool:
     return abs(h - w * height / width) <= 1 or abs(w - h * width / height) <= 1
 
 
+def _require_pixels(lens: Lens) -> None:
+    """Refuse numbers that are shares of the image, which would otherwise pass for a camera of nearly 180 degrees.
+
+    Raises:
+        InputError: So it is.
+    """
+    size = f"an image of {lens.width} x {lens.height}"
+    if min(lens.width, lens.height) > 2 and 0 < lens.cx <= 1 and 0 < lens.cy <= 1:
+        raise InputError(
+            f"principal point ({lens.cx:g}, {lens.cy:g}) of {size} is in shares of it; give cx and cy in pixels"
+        )
+    if lens.model == "perspective" and max(lens.fx / lens.width, lens.fy / lens.height) < LEAST_FOCAL:
+        raise InputError(
+            f"focal lengths {lens.fx:g}, {lens.fy:g} of {size} see more than 168 degrees; are they in pixels?"
+        )
+
+
 @lru_cache(maxsize=64)
 def pinhole_matrix(lens: Lens) -> NDArray[np.float64]:
     """Intrinsics of the undistorted image, float64 [3, 3].
@@ -246,6 +264,7 @@ def pinhole_view(where: str, stem: str, lens: Lens, world_to_camera: NDArray[np.
         InputError: The lens has no pinhole stand-in, or the pose is not rigid.
     """
     try:
+        _require_pixels(lens)
         K = torch.from_numpy(pinhole_matrix(lens).copy())
         camera = Camera(K, torch.from_numpy(world_to_camera), lens.width, lens.height)
     except InputError as error:

@@ -36,6 +36,11 @@ def load_views(path: str | os.PathLike[str], image_folder: str | None = None, ph
     files = [path] if os.path.isfile(path) else [path / name for name in TRANSFORMS]
     transforms = next((file for file in files if file.is_file()), None)
     if transforms is not None:
+        if transforms.suffix.lower() != ".json":
+            raise InputError(
+                f"{transforms}: is no data set of posed photographs; give its folder, or a transforms.json (archives "
+                "must be unpacked)"
+            )
         if image_folder is not None:
             raise InputError(f"{transforms}: lists its photographs by path; --images is for COLMAP models only")
         return _placed(path, read_transforms(transforms, photographs))

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path, PurePosixPath
@@ -24,7 +25,8 @@ TRANSFORMS = ("transforms.json", "transforms_train.json")
 FAR = 1000.0  # distance of the cameras from the origin at which float32 blurs what they see [radius of the cameras]
 GRID = 10.0  # the origin moves in powers of ten at least this large [radius of the cameras]
 TOLERANCE = 0.01  # between the cameras of two files, after a transform [radius of the cameras]
-LEAST_COMMON = 3  # photographs that both list
+LEAST_COMMON = 2  # photographs that both list
+ARM = 0.1  # length of the axes of a camera when it is compared with another [radius of the cameras]
 
 
 def far_origin(places: Array) -> Array | None:
@@ -77,15 +79,34 @@ def transform_of_points(transforms: Path, meta: Mapping[str, Any], model: Path) 
     ours, theirs = _common_cameras(meta, model)
     if len(ours) < LEAST_COMMON:
         return declared
-    radius = float(np.linalg.norm(ours - ours.mean(axis=0), axis=1).max()) or 1.0
-    if _distance(declared, theirs, ours) <= TOLERANCE * radius:
+    radius = _radius(ours)
+    if _distance(declared, _arms(theirs), _arms(ours)) <= TOLERANCE * radius:
         return declared
-    measured = similarity_between(theirs, ours)
-    if _distance(measured, theirs, ours) > TOLERANCE * radius:
-        logger.warning("%s: its cameras are not those of %s, whose points are not used", transforms, model)
-        return None
-    logger.warning("%s: its cameras are those of %s in another frame; the points are moved there", transforms, model)
-    return measured
+    measured = similarity_between(_arms(theirs), _arms(ours))
+    if _distance(measured, _arms(theirs), _arms(ours)) <= TOLERANCE * radius:
+        logger.warning(
+            "%s: its cameras are those of %s in another frame; the points are moved there", transforms, model
+        )
+        return measured
+    reason = ""
+    turned = ours * np.array([1.0, 1.0, -1.0, -1.0])[:, None]
+    for matrix in (declared, similarity_between(_arms(theirs), _arms(turned))):
+        if _distance(matrix, _arms(theirs), _arms(turned)) <= TOLERANCE * radius:
+            reason = ": they look the other way; its poses have to be in OpenGL's axes, x right, y up, z back"
+    logger.warning("%s: its cameras are not those of %s, whose points are not used%s", transforms, model, reason)
+    return None
+
+
+def _radius(cameras: Array) -> float:
+    """Of the places of cameras around their center; 1 if all are in one place."""
+    places = cameras[:, 0]
+    return float(np.linalg.norm(places - places.mean(axis=0), axis=1).max()) or 1.0
+
+
+def _arms(cameras: Array) -> Array:
+    """Places of cameras and of points ahead of them along their axes, which tell how cameras on a line are turned."""
+    places, axes = cameras[:, :1], cameras[:, 1:]
+    return np.concatenate([places, places + ARM * _radius(cameras) * axes], axis=1).reshape(-1, 3)
 
 
 def _declared(transforms: Path, meta: Mapping[str, Any]) -> Array:
@@ -106,32 +127,34 @@ def _declared(transforms: Path, meta: Mapping[str, Any]) -> Array:
 
 
 def _common_cameras(meta: Mapping[str, Any], model: Path) -> tuple[Array, Array]:
-    """Places of the cameras that both list by file name, in the file's world and in the model's, [N, 3] each."""
-    ours, theirs = (_by_file_name(places) for places in (_places_in_transforms(meta), _places_in_model(model)))
+    """The cameras that both list by file name, in the file's world and in the model's, [N, 4, 3] each."""
+    ours, theirs = (_by_file_name(cameras) for cameras in (_cameras_in_transforms(meta), _cameras_in_model(model)))
     common = sorted(set(ours) & set(theirs))
-    return tuple(np.array([places[name] for name in common]).reshape(-1, 3) for places in (ours, theirs))  # type: ignore[return-value]
+    return tuple(np.array([cameras[name] for name in common]).reshape(-1, 4, 3) for cameras in (ours, theirs))  # type: ignore[return-value]
 
 
 def camera_places(data_set: Path) -> Array:
     """Places of all cameras that a data set lists, usable or not [world units], [N, 3]."""
     files = [data_set] if data_set.is_file() else [data_set / name for name in TRANSFORMS]
     if file := next((file for file in files if file.is_file()), None):
-        places = _places_in_transforms(read_json(file))
+        cameras = _cameras_in_transforms(read_json(file))
     elif model := find_model(data_set):
-        places = _places_in_model(model)
+        cameras = _cameras_in_model(model)
     else:
-        places = {}
-    return np.array(list(places.values())).reshape(-1, 3)
+        cameras = {}
+    return np.array(list(cameras.values())).reshape(-1, 4, 3)[:, 0]
 
 
-def _by_file_name(places: Mapping[str, Array]) -> dict[str, Array]:
+def _by_file_name(cameras: Mapping[str, Array]) -> dict[str, Array]:
     """Without folders and endings, as far as names are unique so."""
-    names = [PurePosixPath(name.replace("\\", "/")).stem for name in places]
-    return {name: place for name, place in zip(names, places.values(), strict=True) if names.count(name) == 1}
+    names = [PurePosixPath(name.replace("\\", "/")).stem for name in cameras]
+    counts = Counter(names)
+    return {name: camera for name, camera in zip(names, cameras.values(), strict=True) if counts[name] == 1}
 
 
-def _places_in_transforms(meta: Mapping[str, Any]) -> dict[str, Array]:
-    places: dict[str, Array] = {}
+def _cameras_in_transforms(meta: Mapping[str, Any]) -> dict[str, Array]:
+    """By name: place and axes x, y, z of OpenCV's camera in the world, [4, 3]."""
+    cameras: dict[str, Array] = {}
     frames = meta.get("frames") if isinstance(meta, Mapping) else None
     for frame in frames if isinstance(frames, list) else []:
         try:
@@ -140,20 +163,23 @@ def _places_in_transforms(meta: Mapping[str, Any]) -> dict[str, Array]:
         except (KeyError, OverflowError, TypeError, ValueError):
             continue  # whoever reads the cameras says what is wrong with the file
         if pose.shape in ((3, 4), (4, 4)) and np.isfinite(pose).all():
-            places[name] = pose[:3, 3]
-    return places
+            x, up, back, place = pose[:3].T
+            cameras[name] = np.stack([place, x, -up, -back])
+    return cameras
 
 
-def _places_in_model(model: Path) -> dict[str, Array]:
-    places: dict[str, Array] = {}
+def _cameras_in_model(model: Path) -> dict[str, Array]:
+    """By name: place and axes x, y, z of the camera in the world, [4, 3]."""
+    cameras: dict[str, Array] = {}
     if not any((model / f"images{suffix}").is_file() for suffix in (".bin", ".txt")):
-        return places  # points may come alone
+        return cameras  # points may come alone
     for record in read_images(model):
         norm = float(np.linalg.norm(record.quat))
         if norm > 0 and np.isfinite(norm) and np.isfinite(record.translation).all():
-            place = -_rotated_back(np.array(record.quat) / norm, np.array(record.translation))
-            places[record.name] = place
-    return places
+            quat = np.array(record.quat) / norm
+            axes = [_rotated_back(quat, axis) for axis in np.eye(3)]
+            cameras[record.name] = np.stack([-_rotated_back(quat, np.array(record.translation)), *axes])
+    return cameras
 
 
 def _rotated_back(quat: Array, vector: Array) -> Array:

@@ -7,6 +7,8 @@ from dataclasses import replace
 
 import torch
 
+from sgwarp.scene.camera import Camera
+from sgwarp.scene.gaussians import Gaussians
 from sgwarp.scene.view import View
 
 EXTENT_MARGIN = 1.1  # of the reference implementation of 3DGS
@@ -52,3 +54,20 @@ def with_near_plane(views: Sequence[View]) -> list[View]:
         return list(views)
     far = LEAST_FAR * camera_extent(views)
     return [replace(view, camera=replace(view.camera, near=near, far=max(view.camera.far, far))) for view in views]
+
+
+def with_near_plane_of(views: Sequence[View], gaussians: Gaussians) -> list[View]:
+    """The views, with nearer near planes where they have the default one and the scene is small.
+
+    Cameras in one place, or one alone, say nothing of the unit: then the distance of the scene does.
+    """
+    means = gaussians.means.detach()[gaussians.finite].double().cpu()
+    if not len(means) or all(view.camera.near != Camera.near for view in views):
+        return list(views)
+    moved = []
+    for view in views:
+        near = NEAR_SHARE * float((means - view.camera.position).norm(dim=1).median())
+        if view.camera.near == Camera.near and 0 < near < Camera.near:
+            view = replace(view, camera=replace(view.camera, near=near))
+        moved.append(view)
+    return moved

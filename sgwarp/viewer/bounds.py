@@ -14,7 +14,7 @@ from sgwarp.scene import Camera
 
 LEAST_SIZE, MOST_SIZE = 16, 4096  # sides of a picture [pixels]
 LEAST_FOV, MOST_FOV = math.radians(1), math.radians(170)
-FAR_AWAY = 1e7  # of a camera or a shift [world units]
+FAR_AWAY = 1e12  # of a camera or a shift [world units], which may be micrometers
 MOST_TEXT = 2000  # letters of a text box
 MOST_PHRASES = 16  # of one text box
 MOST_PHRASE = 200  # letters of a phrase

@@ -258,5 +258,5 @@ def _depth_range(given: Materials) -> tuple[float, float]:
     if near is None:
         means = given.gaussians.means[given.gaussians.finite]
         spread = (means - means.median(dim=0).values).norm(dim=1).median() if len(means) else torch.ones(())
-        near = max(float(spread) / LEAST_STEPS, 1e-6)
+        near = max(float(spread) / LEAST_STEPS, 1e-12)
     return near, near * 1e8

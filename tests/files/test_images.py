@@ -1,6 +1,7 @@
 import struct
 import zlib
 
+import cv2
 import numpy as np
 import pytest
 import torch
@@ -8,7 +9,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from sgwarp.errors import InputError
-from sgwarp.files.images import read_ids, read_rgb, read_size, write_ids, write_rgb
+from sgwarp.files.images import read_alpha, read_ids, read_rgb, read_size, write_ids, write_rgb
 
 
 def png(width, height, depth, colour_type, rows, *chunks):
@@ -200,3 +201,30 @@ def test_damaged_label_image(tmp_path_factory, allow_input_error, position, valu
     path.write_bytes(bytes(data))
     with allow_input_error(path):
         assert read_ids(path).dtype == np.int32
+
+
+def test_alpha_is_told_by_the_content_not_the_name(tmp_path):
+    pixels = np.random.default_rng(0).integers(0, 256, (6, 8, 4), dtype=np.uint8)
+    data = cv2.imencode(".png", pixels)[1].tobytes()
+    (tmp_path / "cut_out.jpg").write_bytes(data)
+    alpha = read_alpha(tmp_path / "cut_out.jpg")
+    assert alpha is not None
+    assert np.array_equal(alpha, pixels[:, :, 3])
+    (tmp_path / "photo.png").write_bytes(cv2.imencode(".jpg", pixels[:, :, :3])[1].tobytes())
+    assert read_alpha(tmp_path / "photo.png") is None
+
+
+def test_colors_of_a_transparent_tiff_are_not_multiplied_by_alpha(tmp_path):
+    """An uncompressed TIFF with an alpha channel that is not multiplied in (TIFF 6.0, ExtraSamples = 2), by hand."""
+    rgba = np.random.default_rng(0).integers(64, 256, (4, 5, 4), dtype=np.uint8)
+    entries = [
+        *[(256, 3, 1, 5), (257, 3, 1, 4), (258, 3, 4, 200), (259, 3, 1, 1), (262, 3, 1, 2), (273, 4, 1, 208)],
+        *[(277, 3, 1, 4), (278, 3, 1, 4), (279, 4, 1, rgba.size), (338, 3, 1, 2)],
+    ]
+    head = b"II*\0" + struct.pack("<IH", 8, len(entries)) + b"".join(struct.pack("<HHII", *e) for e in entries)
+    data = (head + bytes(4)).ljust(200, b"\0") + struct.pack("<4H", 8, 8, 8, 8) + rgba.tobytes()
+    (tmp_path / "a.tif").write_bytes(data)
+    assert np.abs(read_rgb(tmp_path / "a.tif").astype(int) - rgba[:, :, :3]).max() <= 2  # 8 bits, there and back
+    alpha = read_alpha(tmp_path / "a.tif")
+    assert alpha is not None
+    assert np.array_equal(alpha, rgba[:, :, 3])

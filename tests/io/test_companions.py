@@ -82,3 +82,16 @@ def test_a_folder_that_is_missing_or_wrong(tmp_path, monkeypatch):
     monkeypatch.setattr("sgwarp.io.companions.MOST_FILES", 1)
     with pytest.raises(InputError, match="holds more than 1 files"):
         Companions(tmp_path, [])
+
+
+def test_words_before_a_name(tmp_path):
+    """As in mask_IMG_1.png; in a mirrored folder before the last part."""
+    put(tmp_path, "cam0/mask_IMG_1.png", "IMG_1.png")
+    (view,) = views("cam0/IMG_1.JPG")
+    files = Companions(tmp_path, [view]).find(view, [".png"], ["mask_", ""])
+    assert [path.relative_to(tmp_path).as_posix() for path in files] == ["cam0/mask_IMG_1.png", "IMG_1.png"]
+
+
+def test_a_path_with_backslashes(tmp_path):
+    put(tmp_path, "cam0/IMG_1.png", "cam1/IMG_1.png")
+    assert found(tmp_path, views("cam0\\IMG_1.JPG", "cam1\\IMG_1.JPG")) == ["cam0/IMG_1.png", "cam1/IMG_1.png"]

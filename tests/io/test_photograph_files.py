@@ -3,6 +3,7 @@
 import json
 import logging
 import shutil
+import struct
 
 import cv2
 import numpy as np
@@ -48,6 +49,58 @@ def test_another_ending_or_letter_case_is_found_and_said(tmp_path, caplog, write
     assert "1 photographs have another ending or letter case than is listed, first" in caplog.text
 
 
+@pytest.mark.parametrize("write", [lambda f, names: transforms(f, names), colmap])
+@pytest.mark.parametrize(
+    ("listed", "stored"),
+    [
+        ("/home/you/room/images/a.png", "a.png"),
+        ("C:\\Users\\you\\images\\cam0\\a.png", "cam0/a.png"),
+        ("D:/room/images/a.png", "a.png"),
+        ("../room/images/a.png", "a.png"),
+        ("images/a.png", "a.png"),
+        ("a.png", "a.png"),
+        ("file:///home/you/images/a%20b.png", "a b.png"),
+        ("my%20%C3%BC.png", "my ü.png"),
+        ("cafe\u0301.png", "caf\u00e9.png"),
+    ],
+)
+def test_names_from_another_machine_or_tool_are_found(tmp_path, write, listed, stored):
+    """Of each the photograph is the one file that its listed path ends like, and not the other one."""
+    photograph(tmp_path / "images" / stored, 70)
+    photograph(tmp_path / "images" / "other.png")
+    write(tmp_path, [listed, "images/other.png"])
+    first, _ = sorted(load_views(tmp_path), key=lambda view: view.name.endswith("other.png"))
+    assert round(float(first.image().mean()) * 255) == 70
+
+
+def test_the_end_of_a_path_that_two_share_is_nobodys(tmp_path, caplog):
+    photograph(tmp_path / "a.png")
+    photograph(tmp_path / "b.png")
+    transforms(tmp_path, ["/x/cam0/a.png", "/x/cam1/a.png", "/x/b.png"])
+    with pytest.raises(InputError, match="lies outside the data set"):
+        load_views(tmp_path)
+    transforms(tmp_path, ["cam0/a.png", "cam1/a.png", "/x/b.png"])
+    assert [view.stem for view in load_views(tmp_path)] == ["b"]
+    assert "1 photographs are listed with paths that do not exist here; files whose paths end alike" in caplog.text
+
+
+@pytest.mark.parametrize("write", [transforms, colmap])
+def test_a_photograph_that_is_listed_twice_counts_once(tmp_path, caplog, write):
+    photograph(tmp_path / "images/a.png")
+    photograph(tmp_path / "images/b.png")
+    write(tmp_path, ["images/a.png", "images/b.png", "./images/a.png", "images/a.png"])
+    assert sorted(view.stem for view in load_views(tmp_path)) == ["a", "b"]
+    assert "left out 2 " in caplog.text
+    assert "that are listed before" in caplog.text
+
+
+def test_photographs_that_differ_in_their_ending_are_two(tmp_path):
+    for name in ("images/a.png", "images/a.jpg", "images/b.png"):
+        photograph(tmp_path / name)
+    transforms(tmp_path, ["images/a.png", "images/a.jpg", "images/b.png"])
+    assert [view.stem for view in load_views(tmp_path)] == ["a.png", "a.jpg", "b"]
+
+
 def test_no_photograph_is_taken_twice(tmp_path, caplog):
     """b.jpg is gone; b.png is listed itself, so that it does not stand in."""
     photograph(tmp_path / "images/a.png")
@@ -88,6 +141,7 @@ def test_whole_paths_into_the_data_set_are_taken(tmp_path):
         ("keyframes/cameras/1.json", b"{}", "Polycam.*ns-process-data polycam"),
         ("pose/0.txt", b"1 0 0 0", "ScanNet"),
         ("cams.xml", b"<?xml ?><document><chunk><cameras>", "Metashape"),
+        ("cameras.json", b'[{"id": 0, "img_name": "a"}]', "3DGS trainer.*give the data set that it was trained on"),
         ("cams.csv", b"#name,x,y,alt", "RealityCapture"),
         ("notes.csv", b"name,weight", "holds no views.*sgwarp poses"),
         ("scene.log", b"0 0 0\n1 0 0 0\n", "Tanks and Temples"),
@@ -101,6 +155,13 @@ def test_captures_that_are_not_read_are_named(tmp_path, file, content, expected)
     (tmp_path / file).write_bytes(content)
     with pytest.raises(InputError, match=expected):
         load_views(tmp_path)
+
+
+def test_masks_and_depth_beside_photographs_are_none(tmp_path):
+    names = ("IMG_1.JPG", "IMG_1_mask.png", "IMG_2.jpg", "dynamic_mask_IMG_2.png", "IMG_2.jpg.png", "depth_IMG_2.tif")
+    for name in (*names, "the_mask.png", "IMG_3.mask.png"):
+        photograph(tmp_path / name)
+    assert photographs_in(tmp_path) == ["IMG_1.JPG", "IMG_2.jpg", "IMG_3.mask.png", "the_mask.png"]
 
 
 def test_only_photographs_are_taken_for_photographs(tmp_path):
@@ -165,3 +226,25 @@ def test_observations_are_not_counted_as_images(tmp_path, caplog):
     (tmp_path / "sparse/0/images.txt").write_text("# list\n" + observed)
     assert len(load_views(tmp_path)) == 4
     assert "holds 2 models (0 with 3, 1 with 4 images)" in caplog.text
+
+
+@pytest.mark.parametrize(("middle", "size"), [((12, 16), (32, 24)), ((16, 12), (24, 32))])
+def test_a_sideways_photograph_without_a_size_is_turned_where_its_middle_asks(tmp_path, middle, size):
+    """Stored 32 wide and 24 high, with EXIF orientation 6; the camera says no size."""
+    data = cv2.imencode(".jpg", np.full((24, 32, 3), 90, np.uint8))[1].tobytes()
+    tiff = b"II*\0" + struct.pack("<IHHHIII", 8, 1, 0x0112, 3, 1, 6, 0)
+    segment = b"Exif\0\0" + tiff
+    exif = b"\xff\xe1" + struct.pack(">H", len(segment) + 2) + segment
+    (tmp_path / "a.jpg").write_bytes(data[:2] + exif + data[2:])
+    frames = [{"file_path": "a.jpg", "transform_matrix": POSE}]
+    meta = {"fl_x": 40.0, "cx": middle[0], "cy": middle[1], "frames": frames}
+    (tmp_path / "transforms.json").write_text(json.dumps(meta))
+    (view,) = load_views(tmp_path)
+    assert view.camera.size == tuple(view.image().shape[:2]) == size
+
+
+def test_a_photograph_that_lacks_a_row_fits_its_camera(tmp_path):
+    cv2.imwrite(str(tmp_path / "a.png"), np.zeros((1080, 1920, 3), np.uint8))
+    transforms(tmp_path, ["a.png"], w=1920, h=1081, fl_x=2000.0)
+    (view,) = load_views(tmp_path)
+    assert view.camera.size == (1080, 1920)

@@ -469,3 +469,17 @@ def test_damaged_anywhere(tmp_path_factory, ply_bytes, allow_input_error, positi
     path.write_bytes(data[:position] + value + data[position + len(value) :])
     with allow_input_error(path):
         load_gaussians(path)
+
+
+def test_a_folder_that_holds_scenes_names_the_last(tmp_path, ply_bytes):
+    """What a 3DGS trainer leaves: the iteration of the highest number counts."""
+    for number in (7000, 30000):
+        folder = tmp_path / f"point_cloud/iteration_{number}"
+        folder.mkdir(parents=True)
+        (folder / "point_cloud.ply").write_bytes(b"")
+    with pytest.raises(InputError, match=r"is a folder; give its scene, .*iteration_30000/point_cloud\.ply"):
+        load_gaussians(tmp_path)
+    (tmp_path / "alone").mkdir()
+    (tmp_path / "alone/a.spz").write_bytes(b"")
+    with pytest.raises(InputError, match=r"is a folder; give its scene, .*alone/a\.spz"):
+        load_gaussians(tmp_path / "alone")

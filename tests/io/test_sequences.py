@@ -256,6 +256,20 @@ def test_meta_files(tmp_path):
     assert not any(one.missing for one in load_moving_views(tmp_path, photographs=False).at(1))
 
 
+@pytest.mark.parametrize("scale", [1e-3, 1e4])
+def test_near_planes_of_meta_files_follow_the_unit(tmp_path, scale):
+    poses = [np.eye(4) for _ in range(3)]
+    for place, pose in zip((-1.0, 0.0, 1.0), poses, strict=True):
+        pose[0, 3] = scale * place
+    lens = [[50.0, 0, 31.0], [0, 51.0, 17.5], [0, 0, 1]]
+    row = [pose.tolist() for pose in poses]
+    content = {"w": 64, "h": 36, "k": [[lens] * 3] * 2, "w2c": [row, row]}
+    (tmp_path / "train_meta.json").write_text(json.dumps(content))
+    for frame in (0, 1):
+        for one in load_moving_views(tmp_path).at(frame):
+            assert one.view.camera.near == pytest.approx(0.01 * 1.1 * scale)
+
+
 @pytest.mark.parametrize(
     ("changed", "message"),
     [

@@ -80,6 +80,40 @@ def test_frame_wins_over_file(dataset):
     assert (a.width, b.width) == (32, 40)
 
 
+def test_numbers_in_quotes_and_nulls(dataset):
+    """`null` is as if the field were not there."""
+    quoted = {key: str(value) for key, value in SHARED.items()}
+    (view,) = read_transforms(dataset([frame(fl_x=None, k1=None, mask_path=None)], **quoted))
+    assert view.camera.K.tolist() == [[50, 0, 14.5], [0, 55, 12.25], [0, 0, 1]]
+    assert view.camera.size == (24, 32)
+    (view,) = read_transforms(dataset([frame()], **{**SHARED, "w": None, "h": None}))
+    assert view.camera.size == (24, 32)
+
+
+def test_field_of_view_in_degrees(dataset):
+    """`x_fov`, `y_fov` of instant-ngp."""
+    (view,) = read_transforms(dataset([frame()], x_fov=90, y_fov="60", w=32, h=24))
+    assert view.camera.K.diagonal().tolist() == pytest.approx([16, 12 * math.sqrt(3), 1])
+
+
+def test_a_size_that_is_missing_is_not_guessed(dataset):
+    """The numbers are those of the photograph before it was made smaller."""
+    with pytest.raises(InputError, match=r"is 32 x 24, while 'cx' and 'cy' are the middle of one of about 64 x 48"):
+        read_transforms(dataset([frame()], fl_x=100.0, cx=32.0, cy=24.0))
+    (view,) = read_transforms(dataset([frame()], fl_x=100.0, cx=32.0, cy=24.0, w=64, h=48))
+    assert view.camera.K.tolist() == [[50, 0, 16], [0, 50, 12], [0, 0, 1]]
+
+
+def test_a_frame_without_name_or_camera_costs_itself(dataset, caplog):
+    path = dataset([frame("0.png"), frame("1.png")], **SHARED)
+    content = json.loads(path.read_text())
+    content["frames"] += [{"transform_matrix": camera_to_world()}, "no frame"]
+    path.write_text(json.dumps(content))
+    assert [view.stem for view in read_transforms(path)] == ["0", "1"]
+    assert "left out 2 frames that cannot be used, first:" in caplog.text
+    assert "frame 2: has no 'file_path'" in caplog.text
+
+
 def test_blender(dataset, tmp_path):
     """camera_angle_x, no size, no extension, names that begin with ./"""
     dataset([frame("train/r_0.png"), frame("train/r_1.png")], size=(30, 40))
@@ -189,7 +223,15 @@ def test_singular_intrinsics(dataset):
     [
         ({"w": 32, "h": 24}, "has no focal length"),
         ({"fl_x": "wide", "w": 32, "h": 24}, "'fl_x' must be a number, got 'wide'"),
-        ({"fl_x": None, "w": 32, "h": 24}, "'fl_x' must be a number, got None"),
+        ({"fl_x": None, "w": 32, "h": 24}, "has no focal length"),
+        ({"fl_x": [50.0], "w": 32, "h": 24}, r"'fl_x' must be a number, got \[50\.0\]"),
+        ({"camera_angle_x": 45.8, "w": 32, "h": 24}, "got 45.8; if these are degrees, name it 'x_fov'"),
+        ({"x_fov": 200, "w": 32, "h": 24}, "degrees between 0 and 180, got 200"),
+        (
+            {**SHARED, "cx": 0.5, "cy": 0.5},
+            r"principal point \(0\.5, 0\.5\) .* in shares of it; give cx and cy in pixels",
+        ),
+        ({**SHARED, "fl_x": 0.8, "fl_y": 1.1}, "focal lengths 0.8, 1.1 .* are they in pixels"),
         ({"camera_angle_x": 3.5, "w": 32, "h": 24}, "between 0 and pi, got 3.5"),
         ({"fl_x": 50, "w": 0, "h": 24}, "'w' must be a positive whole number of pixels, got 0"),
         ({"fl_x": 50, "w": 32, "h": 24.5}, "'h' must be a positive whole number"),
@@ -284,8 +326,10 @@ def test_pinhole_without_coefficients_is_left_alone(dataset):
 def test_stems_are_unique(dataset):
     views = read_transforms(dataset([frame("a/0.png"), frame("b/0.png"), frame("b/1.png")], **SHARED))
     assert [view.stem for view in views] == ["a_0", "b_0", "b_1"]
-    with pytest.raises(InputError, match=r"'a/0\.png' and 'a/0\.png' are both view 'a_0'; rename or drop one"):
-        read_transforms(dataset([frame("a/0.png"), frame("a/0.png")], **SHARED))
+    with pytest.raises(
+        InputError, match=r"'a/b/0\.png' and 'a_b/0\.png' are both view 'a_b_0\.png'; rename or drop one"
+    ):
+        read_transforms(dataset([frame("a/b/0.png"), frame("a_b/0.png")], **SHARED))
 
 
 def test_order_is_that_of_the_file(dataset):

@@ -97,5 +97,5 @@ def test_nothing_there(tmp_path):
     ):
         load_views(tmp_path)
     (tmp_path / "scene.ply").write_bytes(b"ply\n\xff")
-    with pytest.raises(InputError, match=r"scene\.ply: is not valid JSON"):
+    with pytest.raises(InputError, match=r"scene\.ply: is no data set of posed photographs; give its folder"):
         load_views(tmp_path / "scene.ply")

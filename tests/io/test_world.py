@@ -2,6 +2,7 @@
 
 import json
 import struct
+import sys
 
 import numpy as np
 import pytest
@@ -32,13 +33,13 @@ def write_model(folder, shift=(0, 0, 0), scale=1.0) -> None:
     (folder / "points3D.bin").write_bytes(data)
 
 
-def write_transforms(folder, places, **meta) -> None:
-    """The same cameras in a transforms.json, at other places; all look along -z of OpenGL."""
+def write_transforms(folder, places, turn=None, **meta) -> None:
+    """The same cameras in a transforms.json, at other places and turned: OpenGL's, whose y points up and z back."""
     frames = []
     for index, place in enumerate(places, 1):
         write_rgb(folder / f"{index}.png", np.zeros((6, 8, 3)))
         pose = np.eye(4)
-        pose[:3, 3] = place
+        pose[:3] = np.c_[(np.eye(3) if turn is None else turn) @ np.diag([1.0, -1.0, -1.0]), place]
         frames.append({"file_path": f"{index}.png", "transform_matrix": pose.tolist()})
     (folder / "transforms.json").write_text(json.dumps({"fl_x": 8, "w": 8, "h": 6, **meta, "frames": frames}))
 
@@ -84,9 +85,8 @@ def test_a_declared_transform_applies_to_the_points(tmp_path, scale, caplog):
     write_model(tmp_path / "colmap/sparse/0")
     factor = scale or 1.0
     extra = {} if scale is None else {"applied_scale": scale}
-    write_transforms(
-        tmp_path, factor * (PLACES @ APPLIED[:, :3].T + APPLIED[:, 3]), applied_transform=APPLIED.tolist(), **extra
-    )
+    moved = factor * (PLACES @ APPLIED[:, :3].T + APPLIED[:, 3])
+    write_transforms(tmp_path, moved, APPLIED[:, :3], applied_transform=APPLIED.tolist(), **extra)
     np.testing.assert_allclose(
         load_points(tmp_path)[0], factor * (POINTS @ APPLIED[:, :3].T + APPLIED[:, 3]), atol=1e-12
     )
@@ -96,9 +96,28 @@ def test_a_declared_transform_applies_to_the_points(tmp_path, scale, caplog):
 def test_a_transform_that_is_not_declared_is_measured(tmp_path, caplog):
     write_model(tmp_path / "colmap/sparse/0")
     turn = np.array([[0.0, -1, 0], [1, 0, 0], [0, 0, 1]])
-    write_transforms(tmp_path, 3 * PLACES @ turn.T + [5, 6, 7])
+    write_transforms(tmp_path, 3 * PLACES @ turn.T + [5, 6, 7], turn)
     np.testing.assert_allclose(load_points(tmp_path)[0], 3 * POINTS @ turn.T + [5, 6, 7], atol=1e-9)
     assert "in another frame; the points are moved there" in caplog.text
+
+
+@pytest.mark.parametrize("count", [2, 5])
+def test_cameras_on_a_line_tell_how_the_points_are_turned_about_it(tmp_path, monkeypatch, count):
+    monkeypatch.setattr(sys.modules[__name__], "PLACES", np.linspace([-1.0, 0, 0], [1.0, 0, 0], count))
+    write_model(tmp_path / "colmap/sparse/0")
+    c, s = np.cos(0.8), np.sin(0.8)
+    turn = np.array([[1.0, 0, 0], [0, c, -s], [0, s, c]])
+    write_transforms(tmp_path, 3 * PLACES @ turn.T + [5, 6, 7], turn)
+    np.testing.assert_allclose(load_points(tmp_path)[0], 3 * POINTS @ turn.T + [5, 6, 7], atol=1e-9)
+
+
+@pytest.mark.parametrize("turn", [np.eye(3), np.array([[0.0, -1, 0], [1, 0, 0], [0, 0, 1]])])
+def test_poses_in_the_axes_of_opencv_are_told_from_those_of_a_model(tmp_path, caplog, turn):
+    write_model(tmp_path / "colmap/sparse/0")
+    write_transforms(tmp_path, PLACES @ turn.T, turn @ np.diag([1.0, -1.0, -1.0]))
+    with pytest.raises(InputError, match="do not belong to"):
+        load_points(tmp_path)
+    assert "its poses have to be in OpenGL's axes" in caplog.text
 
 
 def test_points_of_other_cameras_are_refused(tmp_path):
@@ -106,6 +125,21 @@ def test_points_of_other_cameras_are_refused(tmp_path):
     write_transforms(tmp_path, np.array([[0.0, 0, 0], [9, 0, 0], [0, 1, 0], [3, 3, 3]]))
     with pytest.raises(InputError, match="do not belong to"):
         load_points(tmp_path)
+
+
+@pytest.mark.parametrize("model", ["sparse/0", "colmap/sparse/0"])
+def test_points_as_ply_within_a_model_are_the_models(tmp_path, model):
+    """3DGS trainers write one beside points3D.bin; a transforms.json moves it as it moves the model's own."""
+    write_model(tmp_path / model)
+    (tmp_path / model / "points3D.bin").unlink()
+    header = (
+        "ply\nformat ascii 1.0\nelement vertex 3\nproperty float x\nproperty float y\nproperty float z\nend_header\n"
+    )
+    rows = "".join(" ".join(map(str, point)) + "\n" for point in POINTS)
+    (tmp_path / model / "points3D.ply").write_text(header + rows)
+    np.testing.assert_allclose(load_points(tmp_path)[0], POINTS, atol=1e-6)
+    write_transforms(tmp_path, 3 * PLACES + [5, 6, 7])
+    np.testing.assert_allclose(load_points(tmp_path)[0], 3 * POINTS + [5, 6, 7], atol=1e-6)
 
 
 @pytest.mark.parametrize("meta", [{"applied_transform": [[1, 2]]}, {"applied_transform": "x"}, {"applied_scale": 0}])

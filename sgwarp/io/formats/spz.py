@@ -42,7 +42,9 @@ GZIP = b"\x1f\x8b"
 HEADER, HEADER_4 = struct.Struct("<IIIBBBB"), struct.Struct("<IIIBBBBI12x")
 STREAM = struct.Struct("<QQ")
 ANTIALIASED, EXTENDED = 1, 2  # flags
-FRACTION_BITS = 12
+FRACTION_BITS, MOST_FRACTION_BITS = 12, 24
+LEAST_STEPS = 2e-4  # of the farthest coordinate, from which on a position is too coarse with these bits
+LEAST_LOG, LARGEST_LOG = -10, 255 / 16 - 10  # of a scale
 COLOR_SCALE = 0.15
 SH_BITS = (5, 4, 4)  # kept of degree 1, 2, 3, as Niantic's writer does
 SH_DEGREES = (0, 3, 8, 15, 24)  # coefficients above degree 0, by degree
@@ -105,6 +107,8 @@ def _read_gzip(path: str | os.PathLike[str], data: bytes) -> tuple[Header, list[
         if len(start) < HEADER.size:
             raise InputError(f"{path}: is cut short: holds no SPZ header; copy or download it again")
         magic, version, count, degree, bits, flags, _ = HEADER.unpack(start)
+        if start[:3] == b"ply":
+            raise InputError(f"{path}: is a PLY file packed with gzip, which is not read; unpack it (gunzip)")
         if magic != MAGIC or version not in VERSIONS[:3]:
             raise InputError(f"{path}: is not an SPZ scene of version 1 to 3 (version {version})")
         header = _checked(path, Header(version, count, degree, bits, flags))
@@ -279,6 +283,8 @@ def _encode(path: str | os.PathLike[str], gaussians: Gaussians, version: int) ->
     means, quats, scales, opacities, sh = host_arrays(gaussians)
     bits = FRACTION_BITS
     farthest = float(np.abs(means).max())
+    while bits < MOST_FRACTION_BITS and 2.0**-bits > LEAST_STEPS * farthest:
+        bits += 1
     while bits and round(farthest * 2.0**bits) > MAX_POSITION:
         bits -= 1
     if bits < FRACTION_BITS:
@@ -290,6 +296,13 @@ def _encode(path: str | os.PathLike[str], gaussians: Gaussians, version: int) ->
     positions = fixed.reshape(-1).view(np.uint8).reshape(-1, 4)[:, :3]
     with np.errstate(divide="ignore"):
         log_scales = np.log(scales.astype(np.float64))
+    beyond = ((log_scales < LEAST_LOG) & (scales > 0)) | (log_scales > LARGEST_LOG)
+    if beyond.any():
+        logging.getLogger("sgwarp").warning(
+            "%s: %d Gaussians have scales outside %.1e to %.0f, which SPZ cannot hold; they are clipped; give the "
+            "scene another unit",
+            *(path, int(beyond.any(axis=1).sum()), np.exp(LEAST_LOG), np.exp(LARGEST_LOG)),
+        )
     xyzw = _unit(quats)[:, [1, 2, 3, 0]]
     arrays = [
         positions,

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from sgwarp.errors import InputError
 from sgwarp.files.arrays import read_array
-from sgwarp.files.images import read_alpha, read_ids, read_rgb
+from sgwarp.files.images import read_alpha, read_ids, read_rgb, read_values
 from sgwarp.io.companions import PICTURES, Companions
 from sgwarp.io.undistort import same_shape
 from sgwarp.scene import View
@@ -22,15 +22,24 @@ OfView = Callable[[View], Any]
 
 MILLIMETER = 1e-3  # [m], the unit of depth images
 WHITE = 128  # from which on a pixel of a lossy mask counts
-MASK_ENDINGS = (*PICTURES, *(f"_mask{suffix}" for suffix in PICTURES))
-DEPTH_ENDINGS = (".npy", ".png", "_depth.npy", "_depth.png")
+MOVING = "dynamic_mask_"  # before the names of instant-ngp's masks, in which white is left out
+MASK_BEGINNINGS = ("", "mask_", MOVING)
+MASK_ENDINGS = tuple(f"{word}{suffix}" for word in ("", "_mask", ".mask", "-mask") for suffix in (*PICTURES, ".npy"))
+DEPTH_BEGINNINGS = ("", "depth_")
+DEPTH_ENDINGS = tuple(f"{word}{suffix}" for word in ("", "_depth") for suffix in (".npy", ".png", ".tif", ".tiff"))
+UNREAD_DEPTH = (".exr", ".pfm", ".npz", ".hdr", ".raw", ".bin", ".dpt", ".jpg", ".jpeg")
 JPEG = (".jpg", ".jpeg")
 
 
-def masks_from_folder(folder: Path, views: Sequence[View]) -> OfView:
-    """Masks of views; zero is left out, and a view without a mask counts as a whole.
+def masks_from_folder(folder: Path, views: Sequence[View], hides: str = "black") -> OfView:
+    """Masks of views; black is left out, and a view without a mask counts as a whole.
 
     Files are found as `Companions` says: {stem}.png, folders that mirror the photographs', COLMAP's double endings.
+
+    Args:
+        folder: Of the masks.
+        views: All of them.
+        hides: "white" for masks in which white is left out; of those named dynamic_mask_{stem}.png it always is.
 
     Returns:
         A function of a view: bool [H, W] of its camera, or None.
@@ -39,13 +48,26 @@ def masks_from_folder(folder: Path, views: Sequence[View]) -> OfView:
         InputError: No view has a mask there.
     """
     companions = Companions(folder, views)
-    paths = {view.stem: found[0] for view in views if (found := companions.find(view, MASK_ENDINGS))}
+    paths = {}
+    for view in views:
+        if found := companions.find(view, MASK_ENDINGS, MASK_BEGINNINGS):
+            paths[view.stem] = found[0]
     missing = [view.stem for view in views if view.stem not in paths]
     if not paths:
         raise InputError(f"{folder}: holds no mask of any view; expected files such as {views[0].stem}.png")
     if missing:
         logger.warning("%s: %d of %d views have no mask (%s, ...)", folder, len(missing), len(views), missing[0])
-    return lambda view: _read_mask(paths[view.stem], view) if view.stem in paths else None
+    inverted = {stem for stem, path in paths.items() if hides == "white" or path.name.lower().startswith(MOVING)}
+    if inverted and hides != "white":
+        logger.warning("%s: in %d masks named %s* white is what is left out", folder, len(inverted), MOVING)
+
+    def mask(view: View) -> Any:
+        if view.stem not in paths:
+            return None
+        known = _read_mask(paths[view.stem], view)
+        return ~known if view.stem in inverted else known
+
+    return mask
 
 
 def masks_of_views(views: Sequence[View]) -> OfView | None:
@@ -68,7 +90,12 @@ def depth_from_folder(folder: Path, views: Sequence[View] | None = None) -> OfVi
     companions = Companions(folder, views or [])
 
     def depth(view: View) -> Any:
-        found = companions.find(view, DEPTH_ENDINGS)
+        found = companions.find(view, DEPTH_ENDINGS, DEPTH_BEGINNINGS)
+        if not found and (other := next((p for p in companions.paths if p.suffix.lower() in UNREAD_DEPTH), None)):
+            raise InputError(
+                f"{other}: depth is read from .npy (meters), .png (millimeters) and .tif, not from {other.suffix}; "
+                "convert it"
+            )
         return _read_depth(found[0] if found else folder / f"{view.stem}.png", view, MILLIMETER)
 
     return depth
@@ -110,7 +137,12 @@ def onto_view(path: Path, array: NDArray[Any], view: View) -> NDArray[Any]:
 
 
 def _read_mask(path: Path, view: View) -> NDArray[np.bool_]:
-    if path.suffix.lower() in JPEG:  # whose black is not quite black
+    if path.suffix.lower() == ".npy":
+        array = read_array(path)
+        if array.ndim != 2:
+            raise InputError(f"{path}: expected a mask [H, W], got {array.dtype} {list(array.shape)}")
+        known = array != 0
+    elif path.suffix.lower() in JPEG:  # whose black is not quite black
         known = read_rgb(path).max(axis=2) >= WHITE
     elif (alpha := read_alpha(path)) is not None:
         known = alpha != 0
@@ -120,10 +152,14 @@ def _read_mask(path: Path, view: View) -> NDArray[np.bool_]:
 
 
 def _read_depth(path: Path, view: View, unit: float) -> NDArray[np.float32]:
-    if path.suffix.lower() != ".npy":
+    if path.suffix.lower() in (".tif", ".tiff"):
+        depth = read_values(path)
+    elif path.suffix.lower() != ".npy":
         return onto_view(path, read_ids(path).astype(np.float32) * np.float32(unit), view)
-    depth = read_array(path)
-    depth = depth[..., 0] if depth.ndim == 3 and depth.shape[2] == 1 else depth
+    else:
+        depth = read_array(path)
+    if depth.ndim == 3 and 1 in (depth.shape[0], depth.shape[2]):
+        depth = depth[..., 0] if depth.shape[2] == 1 else depth[0]
     if depth.ndim != 2 or depth.dtype.kind not in "fiu":
         raise InputError(f"{path}: expected depth [H, W], got {depth.dtype} {list(depth.shape)}")
     scale = unit if depth.dtype.kind in "iu" else 1.0

@@ -15,7 +15,7 @@ import torch
 from torch import Tensor
 
 from sgwarp.scene import Camera, Gaussians, View
-from sgwarp.scene.extent import camera_extent, near_plane
+from sgwarp.scene.extent import NEAR_SHARE, camera_extent, near_plane
 
 
 @dataclass(frozen=True, eq=False)
@@ -33,10 +33,17 @@ class Frame:
     near: float | None
 
     @classmethod
-    def around(cls, views: Sequence[View]) -> Frame:
-        """The frame of these cameras."""
+    def around(cls, views: Sequence[View], positions: Any = None) -> Frame:
+        """The frame of these cameras; if all are in one place, the distance of positions [N, 3] is its unit."""
         origin = torch.stack([view.camera.position for view in views]).mean(dim=0)
         scale, near = camera_extent(views), near_plane(views)
+        if near is None and positions is not None:
+            positions = positions if isinstance(positions, Tensor) else torch.from_numpy(np.asarray(positions))
+            distances = (positions.detach().cpu().to(torch.float64).reshape(-1, 3) - origin).norm(dim=1)
+            distances = distances[torch.isfinite(distances) & (distances > 0)]
+            if len(distances):
+                scale = float(distances.median())
+                near = NEAR_SHARE * scale
         return cls(origin, scale, None if near is None else near / scale)
 
     def view(self, view: View) -> View:

@@ -21,6 +21,8 @@ from sgwarp.scene import Camera, View
 
 logger = logging.getLogger("sgwarp")
 LEAST_VIEWS = 3  # with fewer, nearly any scene explains them
+DARK = 16  # of 255, that no pixel exceeds
+MUCH_HIDDEN = 0.7  # of the pixels, from which on masks may have been meant the other way round
 
 Masks = Callable[[View], Any]
 
@@ -87,6 +89,7 @@ def read_photographs(
     photographs: list[Photograph] = []
     failed: list[InputError] = []
     hidden: list[str] = []
+    dark: list[Path] = []
     store = PixelStore(device)
     report(0, len(views), "")
     for done, view in enumerate(views, start=1):
@@ -101,6 +104,8 @@ def read_photographs(
                 hidden.append(view.stem)
             else:
                 photographs.append(photograph)
+                if photograph.path is not None and int(photograph.pixels.max()) <= DARK:
+                    dark.append(photograph.path)
         report(done, len(views), view.stem)
     if failed and not photographs:
         raise failed[0]
@@ -110,6 +115,20 @@ def read_photographs(
         )
     if hidden:
         logger.warning("left out %d photographs whose mask leaves no pixel, first %s", len(hidden), hidden[0])
+    if dark:
+        logger.warning(
+            "%d photographs are nearly black, first %s; 16-bit files whose values reach 1023 or 4095 only must be "
+            "stretched first",
+            *(len(dark), dark[0]),
+        )
+    masked = [float(photograph.mask.float().mean()) for photograph in photographs if photograph.mask is not None]
+    masked += [0.0] * len(hidden)
+    if masked and sum(masked) / len(masked) < 1 - MUCH_HIDDEN:
+        logger.warning(
+            "masks leave out %.0f %% of the pixels of %d photographs; if they mark what is to be left out, say "
+            "--mask-hides white",
+            *(100 * (1 - sum(masked) / len(masked)), len(masked)),
+        )
     scaled = [view.camera for view in views if largest and max(view.camera.size) // downscale > largest]
     if scaled:
         logger.warning(

@@ -128,7 +128,7 @@ def fit(
         raise InputError("resume: name the file of the checkpoint")
     if checkpoint_every < 1:
         raise InputError(f"checkpoint_every: expected at least 1, got {checkpoint_every}")
-    frame = Frame.around(views)
+    frame = Frame.around(views, start.means if isinstance(start, Gaussians) else None if start is None else start[0])
     with log.stage("read"):
         photographs, shown = (
             read_photographs(

@@ -19,7 +19,7 @@ from sgwarp.files.atomic import atomic_path
 from sgwarp.files.documents import read_json
 from sgwarp.files.images import read_size
 from sgwarp.io.foreign_captures import describe_unread
-from sgwarp.io.stems import is_image_name
+from sgwarp.io.stems import IMAGE_ENDINGS, is_image_name
 from sgwarp.reconstruction.sfm.features import (
     SfmSettings,
     choose_pairs,
@@ -37,6 +37,7 @@ NOT_COLMAP = (".webp",)
 LEAST_PHOTOGRAPHS = 3
 # Folders of what belongs to photographs, without a final s; Polycam's corrected copies show each photograph again.
 BESIDE = frozenset(("mask", "depth", "label", "semantic", "normal", "confidence", "segmentation", "corrected_image"))
+BEGINNINGS, ENDINGS = ("mask_", "dynamic_mask_", "depth_"), ("_mask", ".mask", "-mask", "_depth")
 FEW_FEATURES = 200  # in a photograph: blurred, dark, or of something even
 FEW_MATCHES = 30  # with any other photograph
 LEAST_ANGLE = 4.0  # between the first two photographs where none have COLMAP's 16 [degrees]
@@ -71,14 +72,27 @@ def photographs_in(folder: Path) -> list[str]:
     """Names of the photographs in a folder and its subfolders, relative to it, in order.
 
     Folders of what belongs to photographs (masks, depth, labels) are left out, and so are smaller copies of another
-    folder (images_4 beside images) and hidden files.
+    folder (images_4 beside images), masks and depth that lie beside their photograph and are named after it, and hidden
+    files.
     """
     with reading(folder):
         files = [path for path in folder.rglob("*") if is_image_name(path) and path.is_file()]
     names = sorted(path.relative_to(folder).as_posix() for path in files)
     names = [name for name in names if not any(part.startswith(".") for part in PurePosixPath(name).parts)]
     places = {PurePosixPath(name).parent for name in names}
-    return [name for name in names if not _belongs_to_others(PurePosixPath(name).parent, places)] or names
+    stems = {str(PurePosixPath(name).with_suffix("")).lower() for name in names}
+    own = [name for name in names if not _belongs_to_others(PurePosixPath(name).parent, places)]
+    return [name for name in own if not _belongs_to_photograph(PurePosixPath(name), stems)] or own or names
+
+
+def _belongs_to_photograph(name: PurePosixPath, stems: Set[str]) -> bool:
+    """Whether a file is the mask or the depth of a photograph beside it, by its name."""
+    stem = name.stem.lower()
+    bare = [stem[len(word) :] for word in BEGINNINGS if stem.startswith(word)]
+    bare += [stem[: -len(word)] for word in ENDINGS if stem.endswith(word)]
+    bare += [stem] * (PurePosixPath(name.stem).suffix.lower() in IMAGE_ENDINGS)  # COLMAP's IMG_1.JPG.png
+    bare = [PurePosixPath(other).stem if PurePosixPath(other).suffix in IMAGE_ENDINGS else other for other in bare]
+    return any(str(name.with_name(other)).lower() in stems for other in bare if other)
 
 
 def _belongs_to_others(place: PurePosixPath, places: Set[PurePosixPath]) -> bool:

@@ -109,6 +109,22 @@ def test_axes_that_the_file_names(tmp_path, scene, caplog):
     assert "1 extension records are left out" in caplog.text
 
 
+def test_small_scenes_keep_their_positions(tmp_path, scene, caplog):
+    """A room in kilometers: with the usual 12 bits of fraction all of it would lie on a few points."""
+    before = scene(4)
+    small = Gaussians(before.means * 1e-3, before.quats, before.scales * 1e-4, before.opacities, before.sh)
+    write_spz(small, tmp_path / "a.spz")
+    after = read_spz(tmp_path / "a.spz")
+    assert (after.means - small.means).abs().max() <= 2e-4 * small.means.abs().max()
+    assert "scales outside 4.5e-05 to 379, which SPZ cannot hold; they are clipped" in caplog.text
+
+
+def test_a_packed_ply_is_named(tmp_path):
+    (tmp_path / "a.ply.gz").write_bytes(gzip.compress(b"ply\nformat binary_little_endian 1.0\n" + bytes(99)))
+    with pytest.raises(InputError, match=r"is a PLY file packed with gzip, which is not read; unpack it"):
+        read_spz(tmp_path / "a.ply.gz")
+
+
 def test_far_coordinates_and_rows_that_are_not_finite(tmp_path, scene, caplog):
     before = scene(4)
     means = before.means.clone()

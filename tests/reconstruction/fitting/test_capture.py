@@ -19,7 +19,8 @@ from sgwarp.reconstruction.fitting.photographs import read_photographs, require_
 from sgwarp.reconstruction.fitting.pixels import PixelStore
 from sgwarp.reconstruction.fitting.settings import FitSettings
 from sgwarp.reconstruction.fitting.trainer import fit
-from sgwarp.scene import Gaussians
+from sgwarp.scene import Camera, Gaussians
+from sgwarp.scene.extent import with_near_plane_of
 
 
 def moved(view, scale, shift):
@@ -149,3 +150,31 @@ def test_without_points_and_features_a_fit_starts_at_random_and_says_so(boards, 
     assert main(["fit", str(tmp_path / "stage"), "--out", str(out), "--steps", "2", "--cap", "300"]) == 0
     assert "starts at random" in capsys.readouterr().err
     assert cv2.imread(str(tmp_path / "scene.held_out.jpg")) is not None
+
+
+@pytest.mark.parametrize("scale", [1e-3, 1.0, 1e4])
+def test_cameras_in_one_place_take_their_unit_from_the_points(boards, scale):
+    """A turning camera has no extent: how far the points are says how long a meter is."""
+    K, (height, width) = boards.views[0].camera.K, boards.views[0].camera.size
+    views = [replace(view, camera=Camera(K, torch.eye(4).double(), width, height)) for view in boards.views]
+    frame = Frame.around(views, load_points(boards.folder)[0] * scale)
+    median = np.median(np.linalg.norm(load_points(boards.folder)[0], axis=1))
+    assert frame.scale == pytest.approx(median * scale)
+    assert frame.camera(views[0].camera).near == pytest.approx(0.01)
+
+
+def test_a_lone_camera_takes_its_near_plane_from_a_small_scene(boards):
+    view = boards.views[2]
+    lone = replace(view, camera=Camera(view.camera.K, view.camera.world_to_camera, *view.camera.size[::-1]))
+    positions = torch.from_numpy(load_points(boards.folder)[0]).float()
+    assert with_near_plane_of([lone], _at(positions))[0].camera.near == 0.01
+    small = moved(lone, 1e-3, torch.zeros(3, dtype=torch.float64))
+    median = float((positions.double() - view.camera.position).norm(dim=1).median())
+    assert with_near_plane_of([small], _at(positions * 1e-3))[0].camera.near == pytest.approx(1e-5 * median, rel=1e-4)
+    assert with_near_plane_of([view], _at(positions))[0] is view  # of several cameras, it is known already
+
+
+def _at(means):
+    count = len(means)
+    quats = torch.tensor([[1.0, 0, 0, 0]]).expand(count, 4)
+    return Gaussians(means, quats, torch.full((count, 3), 0.1), torch.ones(count), torch.zeros(count, 1, 3))

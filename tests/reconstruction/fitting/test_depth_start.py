@@ -117,3 +117,19 @@ def test_a_data_set_may_name_depth_of_some_views(boards):
     with pytest.raises(InputError, match="view 0000: the data set names no depth of it"):
         of_view(views[0])
     assert depth_of_views(boards.views) is None
+
+
+def test_depth_that_is_roughly_right_stays_as_it_is_given():
+    """One depth for all of a view fits better still from afar, where there is no parallax to contradict it."""
+    cameras = []
+    for x in np.linspace(-0.8, 0.8, 6):
+        pose = torch.eye(4, dtype=torch.float64)
+        pose[0, 3] = -x
+        turned = torch.eye(4, dtype=torch.float64)
+        angle = math.atan2(x, 3.3)
+        turned[0, 0] = turned[2, 2] = math.cos(angle)
+        turned[0, 2], turned[2, 0] = math.sin(angle), -math.sin(angle)
+        cameras.append(Camera(torch.tensor([[40.0, 0, 32], [0, 40, 24], [0, 0, 1]]), turned @ pose, 64, 48))
+    views = [View(str(index), camera) for index, camera in enumerate(cameras)]
+    found = measure_depth_unit([np.full((48, 64), 3.0)] * 6, cameras, camera_extent(views))
+    assert found.factor == 1

@@ -223,6 +223,61 @@ def test_masks(boards, tmp_path):
     assert read_photographs(views[:1], masks=masks) == []
 
 
+@pytest.mark.parametrize(
+    ("name", "white_is_left_out"),
+    [
+        *(("0000.png", False), ("0000_mask.png", False), ("mask_0000.png", False), ("0000.mask.png", False)),
+        *(("0000.npy", False), ("dynamic_mask_0000.png", True)),
+    ],
+)
+def test_spellings_of_masks(boards, tmp_path, name, white_is_left_out):
+    """In instant-ngp's dynamic_mask_ white is what moves; --mask-hides white says so of any."""
+    mask = np.zeros((48, 64), np.uint8)
+    mask[:, :20] = 255
+    if name.endswith(".npy"):
+        np.save(tmp_path / name, mask > 0)
+    else:
+        cv2.imwrite(str(tmp_path / name), mask)
+    views = boards.views[:1]
+    np.testing.assert_array_equal(masks_from_folder(tmp_path, views)(views[0]), (mask > 0) ^ white_is_left_out)
+    np.testing.assert_array_equal(masks_from_folder(tmp_path, views, "white")(views[0]), mask == 0)
+
+
+def test_masks_that_hide_nearly_all_may_be_the_other_way_round(boards, caplog):
+    mask = np.zeros((48, 64), np.uint8)
+    mask[:, :6] = 1
+    read_photographs(boards.views[:3], masks=lambda view: mask)
+    assert "masks leave out 91 % of the pixels of 3 photographs" in caplog.text
+    assert "--mask-hides white" in caplog.text
+    caplog.clear()
+    read_photographs(boards.views[:3], masks=lambda view: 1 - mask)
+    assert not caplog.text
+
+
+@pytest.mark.parametrize("name", ["0000.tif", "0000_depth.tiff", "depth_0000.png", "depth_0000.npy", "0000.npy"])
+def test_spellings_of_depth(boards, tmp_path, name):
+    """Floating point is meters, whole numbers are millimeters."""
+    depth = np.linspace(1, 5, 48 * 64).reshape(48, 64).astype(np.float32)
+    if name.endswith(".npy"):
+        np.save(tmp_path / name, depth[None] if name == "0000.npy" else depth)
+    else:
+        cv2.imwrite(str(tmp_path / name), (depth * 1000).round().astype(np.uint16) if "png" in name else depth)
+    found = depth_from_folder(tmp_path, boards.views)(boards.views[0])
+    np.testing.assert_allclose(found, depth, atol=6e-4)
+
+
+def test_depth_of_formats_that_are_not_read_is_named(boards, tmp_path):
+    (tmp_path / "0000.exr").write_bytes(b"\x76\x2f\x31\x01")
+    with pytest.raises(InputError, match=r"0000\.exr: depth is read from \.npy .* not from \.exr; convert it"):
+        depth_from_folder(tmp_path, boards.views)(boards.views[0])
+
+
+def test_photographs_of_twelve_bits_in_sixteen_are_nearly_black(boards, tmp_path, caplog):
+    cv2.imwrite(str(tmp_path / "a.png"), np.full((48, 64, 3), 4000, np.uint16))
+    read_photographs([replace(boards.views[0], image_path=tmp_path / "a.png"), *boards.views[1:3]])
+    assert "1 photographs are nearly black, first " in caplog.text
+
+
 def test_masked_pixels_do_not_count(boards):
     """A corner painted over in every photograph spoils the scene, unless it is masked."""
     views, points = boards.views, load_points(boards.folder)
