@@ -179,10 +179,7 @@ def rank(
     threads: int = 1,
     out: tuple[np.ndarray, np.ndarray] | None = None,
 ) -> tuple[np.ndarray, np.ndarray]:
-    """The `places` rows of largest alpha T at each pixel, int32 [H, W, places], -1 for none, and their alpha T.
-
-    Needs AVX-512.
-    """
+    """The `places` rows of largest alpha T at each pixel, int32 [H, W, places], -1 for none, and their alpha T."""
     n, f, shape = len(opacity), np.float32, (height, width, places)
     rows, weights = out or (np.empty(shape, np.int32), np.empty(shape, f))
     library("limit").rank(

@@ -20,8 +20,51 @@ def put(t: wp.tile[float], place: int, value: float): ...  # by one thread; the 
 def put_vector(t: wp.tile[wp.vec4], place: int, value: wp.vec4): ...
 
 
+@wp.func_native("t.data.ptr[place] = value;")
+def put_int(t: wp.tile[int], place: int, value: int): ...
+
+
+@wp.func_native("t.data.ptr[place] = value;")
+def put_double(t: wp.tile[wp.float64], place: int, value: wp.float64): ...
+
+
 @wp.func_native("WP_TILE_SYNC();")
 def barrier(): ...  # all threads of the block come here before any goes on
+
+
+@wp.func_native("""
+#if defined(__CUDA_ARCH__)
+    __threadfence();
+#endif
+""")
+def fence(): ...  # other blocks see what this thread has written before they see what it writes from now on
+
+
+@wp.func_native("return *(const volatile float*)(values.data + place);")
+def latest(values: wp.array[float], place: int) -> float: ...  # as another block left it, past this one's cache
+
+
+@wp.func_native("return *(const volatile double*)(values.data + place);")
+def latest_double(values: wp.array[wp.float64], place: int) -> wp.float64: ...
+
+
+@wp.func
+def comes_last(arrived: wp.array[int], place: int, blocks: int, t: int, flag: wp.tile[int, 1]) -> bool:
+    """Whether this block is the last of `blocks` to come here: it then sees what all of them wrote before.
+
+    The counter is zero before, and again afterwards. What the last block adds up, it adds up in an order of its own, so
+    that the sum does not depend on which block that is.
+    """
+    fence()
+    barrier()
+    if t == 0:
+        before = wp.atomic_add(arrived, place, 1)
+        if before == blocks - 1:
+            arrived[place] = 0
+        put_int(flag, 0, before)
+    barrier()
+    fence()
+    return wp.tile_extract(flag, 0) == blocks - 1
 
 
 @wp.func_native("""

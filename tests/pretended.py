@@ -51,6 +51,40 @@ ALLOCATIONS = ("empty", "empty_like", "empty_strided", "new_empty")  # launch no
 HOST = {aten.detach, aten.alias, aten.view, aten.lift_fresh, aten._unsafe_view}  # launch nothing
 
 
+# Tensors that one launch over lists of tensors takes, by the number of lists; elements of a block; blocks of a launch.
+# From torch's aten/src/ATen/native/cuda/MultiTensorApply.cuh.
+TOGETHER, CHUNK, BLOCKS = {1: 110, 2: 64, 3: 48, 4: 36, 5: 30}, 65536, 320
+
+
+def kernels_of(name: str, args: Any) -> int:
+    """How many kernels an operation of torch launches on CUDA.
+
+    Counted are batch normalization, which takes statistics or sums in one kernel and maps in another, and operations on
+    lists of tensors; all else counts as one, though sorting takes several.
+    """
+    if name in ALLOCATIONS:
+        return 0
+    if name.startswith("native_batch_norm"):
+        return 2 if name.endswith("backward") or args[5] else 1
+    if name.startswith(("_foreach_", "_fused_")):
+        lists = [a for a in args if isinstance(a, (list, tuple)) and a and isinstance(a[0], torch.Tensor)]
+        depth = min(len(lists), 4 if name.startswith("_fused_") else 5)  # the counters of steps come along
+        return _launches_over([tensor.numel() for tensor in lists[0]], TOGETHER[depth])
+    return 1
+
+
+def _launches_over(sizes: list[int], together: int) -> int:
+    launches, tensors, blocks = 0, 0, 0
+    for size in sizes:
+        tensors += 1
+        chunks = -(-size // CHUNK)
+        for chunk in range(1, chunks + 1):
+            blocks += 1
+            if blocks == BLOCKS or (tensors == together and chunk == chunks):
+                launches, blocks, tensors = launches + 1, 0, 0 if chunk == chunks else 1
+    return launches + (blocks > 0)
+
+
 class MixedDevicesError(RuntimeError):
     """A tensor of the CPU met one of the device."""
 
@@ -144,6 +178,7 @@ class PretendedDevice:
     Attributes:
         launches: Keys of the kernels launched, in order.
         calls: How often each operation of torch ran there, those left out that only look at memory in another way.
+        kernels: How many kernels these operations launch, by their names.
         waits: What the host waited for, and the line of the package that made it: (operation, file:line).
         uploads: What the host sent there, likewise. Copies from pageable memory do not wait, but no graph holds them.
     """
@@ -151,6 +186,7 @@ class PretendedDevice:
     def __init__(self) -> None:
         self.launches: list[str] = []
         self.calls: Counter[str] = Counter()
+        self.kernels: Counter[str] = Counter()
         self.waits: list[tuple[str, str]] = []
         self.uploads: list[tuple[str, str]] = []
         self.is_capturing = False
@@ -160,12 +196,12 @@ class PretendedDevice:
 
     @property
     def work(self) -> int:
-        """Launches, and operations of torch that run something: each takes one launch at least."""
-        return len(self.launches) + sum(count for name, count in self.calls.items() if name not in ALLOCATIONS)
+        """Launches of Warp, and of torch: as many as `kernels_of` knows, one at least."""
+        return len(self.launches) + self.kernels.total()
 
     def reset(self) -> None:
         """Forget what happened."""
-        for record in (self.launches, self.calls, self.waits, self.uploads):
+        for record in (self.launches, self.calls, self.kernels, self.waits, self.uploads):
             record.clear()
 
     @contextmanager
@@ -223,7 +259,9 @@ class PretendedDevice:
         if func._schema.is_mutable and tensors and isinstance(args[0] if args else None, torch.Tensor):
             there = isinstance(args[0], DeviceTensor) or isinstance(kwargs.get("out"), DeviceTensor)
         if there and packet not in HOST and not func.is_view:
-            self.calls[packet._qualified_op_name.removeprefix("aten::")] += 1
+            name = packet._qualified_op_name.removeprefix("aten::")
+            self.calls[name] += 1
+            self.kernels[name] += kernels_of(name, args)
         with torch._C._DisableTorchDispatch():
             result = func(*tree_map(plain, args), **tree_map(plain, kwargs))
         return tree_map(claimed, result) if there else result
@@ -390,6 +428,8 @@ def _pretend_torch(patch: pytest.MonkeyPatch, device: PretendedDevice) -> None:
     patch.setattr(_WorkItem, "run", run)
     autocast = torch.autocast
     patch.setattr(torch, "autocast", lambda kind, *args, **kwargs: autocast("cpu", *args, **kwargs))
+    for name in ("is_autocast_enabled", "get_autocast_dtype"):
+        patch.setattr(torch, name, lambda kind="cpu", ask=getattr(torch, name): ask("cpu"))
 
 
 def _pretend_gradients(patch: pytest.MonkeyPatch, device: PretendedDevice) -> None:

@@ -107,3 +107,38 @@ def make_list_pairs(write: bool) -> wp.Kernel:
             counts_out[place] = count
 
     return list_pairs
+
+
+@wp.func
+def row_of(keys: wp.array[wp.int64], key: wp.int64) -> int:
+    """Place of a key among the sorted keys, -1 if it is not there."""
+    place = first_not_below(keys, key)
+    if place < keys.shape[0] and keys[place] == key:
+        return place
+    return -1
+
+
+@wp.kernel
+def tabulate_neighbors(
+    # In:
+    side: int,  # of the kernel
+    step: int,  # between neighbouring offsets [voxels]
+    sources: wp.array[wp.int64],  # [N] sorted keys of the voxels that are read
+    targets: wp.array[wp.int64],  # [M] sorted keys of the voxels that are written
+    # Out:
+    by_target_out: wp.array2d[int],  # [K, M] source of each target, -1 where it has none
+    by_source_out: wp.array2d[int],  # [K, N] the other way round, or empty
+):
+    """Both tables of a kernel map; one thread per offset and voxel. Neighbours search for neighbouring keys."""
+    k, i = wp.tid()
+    first = -(side / 2) * (side % 2)
+    x = wp.int64((first + k % side) * step)
+    y = wp.int64((first + k / side % side) * step)
+    z = wp.int64((first + k / side / side) * step)
+    along = wp.int64(1) << wp.int64(AXIS_BITS)
+    added = (x * along + y) * along + z
+    if i < targets.shape[0]:
+        by_target_out[k, i] = row_of(sources, targets[i] + added)
+    else:
+        i -= targets.shape[0]
+        by_source_out[k, i] = row_of(targets, sources[i] - added)

@@ -32,6 +32,7 @@ CHUNKS_PER_THREAD = 8  # enough to even out tiles of different cost
 MAX_THREADS = 512
 LEAST_DRIVER = 580  # of NVIDIA, that the wheels of Warp 1.19 take; they are built with CUDA 13
 SMALL = 256  # below this many threads of a launch, a second host thread costs more than it saves
+MOST_COUNTERS = 4096  # that a launch needs, as a rule
 
 
 def _init_warp() -> None:
@@ -235,10 +236,15 @@ def launch_blocks(
 
 
 def launch_plain(
-    kernel: wp.Kernel, count: int, inputs: Sequence[Any], outputs: Sequence[Any], *, device: torch.device
+    kernel: wp.Kernel,
+    count: int | tuple[int, int],
+    inputs: Sequence[Any],
+    outputs: Sequence[Any],
+    *,
+    device: torch.device,
 ) -> None:
     """Run a kernel that takes no `base`, in one launch."""
-    if count == 0:
+    if count == 0 or (isinstance(count, tuple) and 0 in count):
         return
     if device.type == "cuda":
         stream = current_stream(device)
@@ -354,6 +360,20 @@ def scratch(name: str, count: int, dtype: torch.dtype, device: torch.device) -> 
     return held[:count]
 
 
+def counters(count: int, device: torch.device) -> Tensor:
+    """int32 zeros that the blocks of a kernel count in (`comes_last`); they are zero again after each launch.
+
+    As scratch, they belong to a thread and a stream, whose launches follow each other.
+    """
+    store: dict[Any, Tensor] = _local.__dict__.setdefault("counters", {})
+    key = (device, torch.cuda.current_stream(device).cuda_stream if device.type == "cuda" else 0)
+    held = store.get(key)
+    if held is None or len(held) < count:
+        with torch.inference_mode(False):
+            held = store[key] = torch.zeros(max(count, MOST_COUNTERS), dtype=torch.int32, device=device)
+    return held
+
+
 LARGE = 32 * 2**20  # the C library maps what is larger anew each time, and the system clears every page
 MAX_IDLE = 2  # large images that are kept for the next one of their size
 
@@ -398,4 +418,5 @@ def _lend(owner: np.ndarray, shape: tuple[int, ...]) -> Tensor:
 def release_scratch() -> None:
     """Give the calling thread's scratch memory back, and what large images left."""
     _local.__dict__.pop("store", None)
+    _local.__dict__.pop("counters", None)
     _idle.clear()

@@ -13,7 +13,7 @@ import torch
 from torch import nn
 
 from sgwarp.errors import InputError
-from sgwarp.network.layers.sparse import BatchNorm, Conv, ConvTranspose, Linear, SparseTensor, join, relu
+from sgwarp.network.layers.sparse import BatchNorm, Conv, ConvTranspose, Linear, SparseTensor, normalized
 
 STEM = 32  # channels after the stem
 
@@ -45,9 +45,11 @@ class BasicBlock(nn.Module):
             self.downsample = nn.Sequential(Linear(in_channels, planes), BatchNorm(planes))
 
     def forward(self, x: SparseTensor) -> SparseTensor:
-        shortcut = x if self.downsample is None else self.downsample(x)
-        y = self.norm2(self.conv2(relu(self.norm1(self.conv1(x)))))
-        return relu(y.with_features(y.features + shortcut.features))
+        y, x = normalized(self.conv1, self.norm1, x)
+        shortcut = x
+        if self.downsample is not None:
+            shortcut, _ = normalized(*self.downsample, x, rectify=False)
+        return normalized(self.conv2, self.norm2, y, shortcut=shortcut)[0]
 
 
 class MinkUNet(nn.Module):
@@ -99,16 +101,22 @@ class MinkUNet(nn.Module):
         if self.training:
             norms = [module for module in self.modules() if isinstance(module, nn.BatchNorm1d)]
             torch._foreach_add_([n.num_batches_tracked for n in norms if n.num_batches_tracked is not None], 1)
-        x = relu(self.bn0(self.conv0p1s1(x)))
-        beside = []
+        x, _ = normalized(self.conv0p1s1, self.bn0, x)
+        encoded: list[SparseTensor] = []
         for conv, norm, block in self._down:
-            beside.append(x)
-            x = relu(self.get_submodule(norm)(self.get_submodule(conv)(x)))
-            x = self.get_submodule(block)(x)
+            y, x = self._normalized(conv, norm, x)
+            encoded.append(x)
+            x = self.get_submodule(block)(y)
         for conv, norm, block in self._up:
-            x = relu(self.get_submodule(norm)(self.get_submodule(conv)(x)))
-            x = self.get_submodule(block)(join(x, beside.pop()))
+            y, _ = self._normalized(conv, norm, x, encoded.pop())
+            x = self.get_submodule(block)(y)
         return x
+
+    def _normalized(
+        self, conv: str, norm: str, x: SparseTensor, beside: SparseTensor | None = None
+    ) -> tuple[SparseTensor, SparseTensor]:
+        layers: Any = self.get_submodule(conv), self.get_submodule(norm)
+        return normalized(*layers, x, beside=beside)
 
     def forward(self, x: SparseTensor) -> SparseTensor:
         """Embedding of every voxel, [N, out_channels]; not normalised."""

@@ -13,7 +13,9 @@ import torch
 from torch import Tensor, nn
 
 from sgwarp.errors import InputError
+from sgwarp.ops.sparse.blocks import MAX_OFFSETS, Running
 from sgwarp.ops.sparse.convolution import sparse_conv
+from sgwarp.ops.sparse.normalization import Normalization, convolve_and_normalize
 from sgwarp.ops.sparse.voxels import KernelMap, coarsen, kernel_map, unpack_voxels
 
 
@@ -107,9 +109,17 @@ class Conv(nn.Module):
         self.kernel = nn.Parameter(torch.empty(side**3, in_channels, out_channels))
         nn.init.normal_(self.kernel, std=math.sqrt(2.0 / (out_channels * side**3)))  # He et al. 2015, fan out
 
+    def connect(self, x: SparseTensor) -> tuple[KernelMap, int]:
+        """Map from the voxels of x to those of the result, and their stride."""
+        return x.grid.map(self.side, x.stride, self.stride, self.dilation), x.stride * self.stride
+
+    @property
+    def weight(self) -> Tensor:
+        return self.kernel
+
     def forward(self, x: SparseTensor) -> SparseTensor:
-        pairs = x.grid.map(self.side, x.stride, self.stride, self.dilation)
-        return SparseTensor(sparse_conv(x.features, self.kernel, pairs), x.grid, x.stride * self.stride)
+        pairs, stride = self.connect(x)
+        return SparseTensor(sparse_conv(x.features, self.kernel, pairs), x.grid, stride)
 
 
 class ConvTranspose(nn.Module):
@@ -122,12 +132,20 @@ class ConvTranspose(nn.Module):
         bound = 1.0 / math.sqrt(out_channels * side**3)
         nn.init.uniform_(self.kernel, -bound, bound)
 
-    def forward(self, x: SparseTensor) -> SparseTensor:
+    def connect(self, x: SparseTensor) -> tuple[KernelMap, int]:
+        """Map from the voxels of x to those of the result, and their stride."""
         if x.stride % self.stride:
             raise InputError(f"voxels at stride {x.stride} cannot be refined by {self.stride}")
         finer = x.stride // self.stride
-        pairs = x.grid.map(self.side, finer, self.stride).swapped()
-        return SparseTensor(sparse_conv(x.features, self.kernel, pairs), x.grid, finer)
+        return x.grid.map(self.side, finer, self.stride).swapped(), finer
+
+    @property
+    def weight(self) -> Tensor:
+        return self.kernel
+
+    def forward(self, x: SparseTensor) -> SparseTensor:
+        pairs, stride = self.connect(x)
+        return SparseTensor(sparse_conv(x.features, self.kernel, pairs), x.grid, stride)
 
 
 class Linear(nn.Module):
@@ -137,6 +155,14 @@ class Linear(nn.Module):
         super().__init__()
         self.kernel = nn.Parameter(torch.empty(in_channels, out_channels))
         nn.init.normal_(self.kernel, std=math.sqrt(2.0 / out_channels))
+
+    def connect(self, x: SparseTensor) -> tuple[KernelMap, int]:
+        """Map from every voxel to itself, and the stride."""
+        return x.grid.map(1, x.stride), x.stride
+
+    @property
+    def weight(self) -> Tensor:
+        return self.kernel[None]
 
     def forward(self, x: SparseTensor) -> SparseTensor:
         return x.with_features(x.features @ self.kernel)
@@ -152,14 +178,69 @@ class BatchNorm(nn.Module):
         super().__init__()
         self.bn = nn.BatchNorm1d(channels)
 
+    def learns(self, rows: int) -> bool:
+        """Whether so many rows are normalised by their own statistics."""
+        return self.training and rows > 1
+
     def forward(self, x: SparseTensor) -> SparseTensor:
         bn = self.bn
         assert bn.momentum is not None
-        learns = self.training and len(x.features) > 1
+        learns = self.learns(len(x.features))
         y = nn.functional.batch_norm(
             x.features, bn.running_mean, bn.running_var, bn.weight, bn.bias, learns, bn.momentum, bn.eps
         )
         return x.with_features(y)
+
+    def as_rows(self, rows: int, rectified: bool) -> Normalization:
+        """The same for the kernels, of so many rows."""
+        bn = self.bn
+        assert bn.momentum is not None
+        assert bn.running_mean is not None
+        assert bn.running_var is not None
+        running = Running(bn.running_mean, bn.running_var, bn.eps, bn.momentum)
+        return Normalization(bn.weight, bn.bias, running, self.learns(rows), rectified)
+
+
+def normalized(
+    conv: Conv | ConvTranspose | Linear,
+    norm: BatchNorm,
+    x: SparseTensor,
+    *,
+    shortcut: SparseTensor | None = None,
+    rectify: bool = True,
+    beside: SparseTensor | None = None,
+) -> tuple[SparseTensor, SparseTensor]:
+    """norm(conv(x)) + shortcut, what is negative becoming zero, joined with `beside`; and x, to go on with.
+
+    On CUDA in single precision kernels do it all, and call neither module nor its hooks; elsewhere the modules do it
+    one after the other. Going on with the x that comes back spares its gradient an addition there.
+    """
+    if _is_fused(x, conv.kernel, norm):
+        pairs, stride = conv.connect(x)
+        if pairs.offsets <= MAX_OFFSETS:
+            z, through = convolve_and_normalize(
+                x.features,
+                conv.weight,
+                pairs,
+                norm.as_rows(pairs.target_count, rectify),
+                None if shortcut is None else shortcut.features,
+                None if beside is None else beside.features,
+            )
+            return SparseTensor(z, x.grid, stride), x.with_features(through)
+    y: SparseTensor = norm(conv(x))
+    if shortcut is not None:
+        y = y.with_features(y.features + shortcut.features)
+    if rectify:
+        y = relu(y)
+    return y if beside is None else join(y, beside), x
+
+
+def _is_fused(x: SparseTensor, kernel: Tensor, norm: BatchNorm) -> bool:
+    """Whether kernels take the whole layer."""
+    tensors = (x.features, kernel, norm.bn.weight, norm.bn.bias, norm.bn.running_mean, norm.bn.running_var)
+    if not x.features.is_cuda or torch.is_autocast_enabled("cuda"):
+        return False
+    return all(tensor is not None and tensor.dtype == torch.float32 for tensor in tensors)
 
 
 def relu(x: SparseTensor) -> SparseTensor:

@@ -204,8 +204,9 @@ class _Run:
         net = self.network.net
         figures = torch.zeros(2, dtype=torch.float64, device=self.device)
         statistics = [buffer for buffer in net.buffers() if buffer.is_floating_point()]
-        before = [buffer.clone() for buffer in statistics]
-        sums = [torch.zeros_like(buffer) for buffer in statistics]
+        before, sums = ([torch.empty_like(buffer) for buffer in statistics] for _ in range(2))
+        torch._foreach_copy_(before, statistics)
+        torch._foreach_zero_(sums)
         self.optimizer.zero_grad()
         for index in chosen[self.processes.rank :: self.processes.count]:
             with self.log.stage("prepare"):

@@ -2,7 +2,7 @@
 
 A target stands at most once within an offset, so the additions of an offset never collide, and the order of the
 offsets is fixed: the result does not depend on threads. Single precision on the CPU runs in a kernel that does all
-three at once; elsewhere rows are copied and multiplied by torch.
+three at once, CUDA has kernels of blocks (blocks.py); elsewhere rows are copied and multiplied by torch.
 """
 
 from __future__ import annotations
@@ -15,14 +15,13 @@ from torch import Tensor
 from torch.autograd.function import once_differentiable
 
 from sgwarp.errors import InputError
-from sgwarp.kernels.sparse import convolution_block
 from sgwarp.kernels.sparse import convolution_lanes as kernels
-from sgwarp.ops.launcher import launch, launch_blocks, scratch, view
+from sgwarp.ops.launcher import launch, scratch, view
+from sgwarp.ops.sparse import blocks
 from sgwarp.ops.sparse.voxels import KernelMap
 
 BLOCK_BYTES, LEAST_BLOCK = 2**17, 64  # rows of a block of targets: those that it reads should stay in the cache
 HALVES = (torch.float16, torch.bfloat16)
-BUSY_BLOCKS, MAX_SHARES = 1024, 16  # of a gradient of the weights: a large GPU has 132 multiprocessors
 
 
 def sparse_conv(features: Tensor, weight: Tensor, kernel_map: KernelMap, *, schedule: str | None = None) -> Tensor:
@@ -63,10 +62,13 @@ class _SparseConv(torch.autograd.Function):
     @staticmethod
     def forward(ctx: Any, features: Tensor, weight: Tensor, kernel_map: KernelMap, schedule: str | None) -> Tensor:
         ctx.save_for_backward(features, weight)
-        ctx.kernel_map, ctx.in_blocks = kernel_map, _fits_blocks(features.dtype, kernel_map, schedule)
-        convolve = _convolve_in_blocks if ctx.in_blocks else _convolve
+        ctx.kernel_map, ctx.in_blocks = kernel_map, blocks.fits_blocks(features.dtype, kernel_map, schedule)
         with torch.autocast(features.device.type, enabled=False):
-            return convolve(features, weight.to(features.dtype), kernel_map)
+            weight = weight.to(features.dtype)
+            if not ctx.in_blocks:
+                return _convolve(features, weight, kernel_map)
+            # Half precision is rounded as it is given; products and sums are single precision.
+            return blocks.convolve(features.float(), weight.float(), kernel_map)[0].to(features.dtype)
 
     @staticmethod
     @once_differentiable
@@ -76,50 +78,18 @@ class _SparseConv(torch.autograd.Function):
         v_features = v_weight = None
         with torch.autocast(features.device.type, enabled=False):
             grad = grad.to(features.dtype).contiguous()
+            rounded = weight.to(features.dtype)
+            if ctx.in_blocks:
+                operands = features.float(), grad.float(), rounded.float()
+                v_features, v_weight = blocks.gradients(*operands, ctx.kernel_map, (for_features, for_weight))
+                v_features = None if v_features is None else v_features.to(features.dtype)
+                v_weight = None if v_weight is None else v_weight.to(weight.dtype)
+                return v_features, v_weight, None, None
             if for_features:
-                turned = weight.to(features.dtype).transpose(1, 2)
-                convolve = _convolve_in_blocks if ctx.in_blocks else _convolve
-                v_features = convolve(grad, turned, ctx.kernel_map.swapped())
+                v_features = _convolve(grad, rounded.transpose(1, 2), ctx.kernel_map.swapped())
             if for_weight:
-                sum_pairs = _weight_gradient_in_blocks if ctx.in_blocks else _weight_gradient
-                v_weight = sum_pairs(features, grad, ctx.kernel_map).to(weight.dtype)
+                v_weight = _weight_gradient(features, grad, ctx.kernel_map).to(weight.dtype)
         return v_features, v_weight, None, None
-
-
-def _fits_blocks(dtype: torch.dtype, kernel_map: KernelMap, schedule: str | None) -> bool:
-    """Whether the kernels of the block schedule take it: on CUDA, all but double precision and very large kernels."""
-    on_cuda = kernel_map.sources.is_cuda if schedule is None else schedule == "block"
-    return on_cuda and dtype != torch.float64 and kernel_map.offsets <= convolution_block.MAX_OFFSETS
-
-
-def _convolve_in_blocks(features: Tensor, weight: Tensor, kernel_map: KernelMap) -> Tensor:
-    """One launch. Half precision is rounded as it is given; products and sums are single precision."""
-    y = torch.empty(kernel_map.target_count, weight.shape[2], device=features.device)
-    table, identity = kernel_map.sources_of_targets, -1 if kernel_map.identity is None else kernel_map.identity
-    inputs = [view(t.to(torch.float32), wp.float32) for t in (features, weight)]
-    grid = [-(-len(y) // convolution_block.TARGETS), -(-y.shape[1] // convolution_block.CHANNELS)]
-    if y.numel():
-        inputs += [view(table, wp.int32), identity]
-        launch_blocks(convolution_block.convolve_blocks, grid, inputs, [view(y, wp.float32)], device=y.device)
-    return y.to(features.dtype)
-
-
-def _weight_gradient_in_blocks(features: Tensor, grad: Tensor, kernel_map: KernelMap) -> Tensor:
-    """One launch, and a sum where there are too few weights to keep a GPU busy; single precision."""
-    offsets, channels = kernel_map.offsets, convolution_block.CHANNELS
-    squares = -(-features.shape[1] // channels) * -(-grad.shape[1] // channels)
-    shares = max(1, min(BUSY_BLOCKS // (offsets * squares), MAX_SHARES))
-    v_weight = torch.empty(shares, offsets, features.shape[1], grad.shape[1], device=features.device)
-    pairs = [view(t, wp.int64) for t in (kernel_map.sources, kernel_map.targets)]
-    inputs = [view(t.to(torch.float32), wp.float32) for t in (features, grad)]
-    inputs += [*pairs, view(kernel_map.starts_on_device, wp.int32)]
-    inputs.append(-1 if kernel_map.identity is None else kernel_map.identity)
-    grid = [shares, offsets, squares]
-    if v_weight.numel():
-        launch_blocks(
-            convolution_block.sum_weight_blocks, grid, inputs, [view(v_weight, wp.float32)], device=v_weight.device
-        )
-    return v_weight[0] if shares == 1 else v_weight.sum(dim=0)
 
 
 def _fits_kernel(features: Tensor, outputs: int) -> bool:

@@ -8,14 +8,15 @@ of a strided convolution are floor(c / stride) * stride in absolute coordinates.
 from __future__ import annotations
 
 import itertools
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
+from typing import Any
 
 import torch
 import warp as wp
 from torch import Tensor
 
 from sgwarp.errors import InputError
-from sgwarp.kernels.sparse import convolution_block, voxels
+from sgwarp.kernels.sparse import voxels
 from sgwarp.ops.launcher import launch, launch_plain, view
 
 AXIS_BITS, BIAS = int(voxels.AXIS_BITS), int(voxels.BIAS)
@@ -91,30 +92,75 @@ def coarsen(keys: Tensor, stride: int) -> Tensor:
 
 @dataclass(frozen=True, eq=False)
 class KernelMap:
-    """Pairs of voxels that a convolution connects, offset by offset.
+    """Which voxels a convolution connects, offset by offset: as pairs or as tables, each made when it is asked for.
+
+    The kernels of CUDA read the tables, which are made in one launch, without a wait; everything else reads the pairs.
 
     Attributes:
-        sources: Row that is read, int64 [pairs].
-        targets: Row that is written, int64 [pairs]; no row twice within an offset.
-        starts: First pair of each of the K^3 offsets, and the number of pairs.
-        source_count, target_count: Rows on either side.
-        identity: Offset that connects every voxel with itself and has no pairs here; None if there is none.
+        side: K of the K^3 kernel.
+        step: Between neighbouring offsets [voxels].
+        keys: Sorted keys of the sources and of the targets as they were before the map was turned; the same tensor for
+            a convolution without stride.
         turned: Whether it was swapped an odd number of times.
-        kept: Tables made of the pairs, shared with the swapped map.
+        kept: What was made so far, shared with the swapped map.
     """
 
-    sources: Tensor
-    targets: Tensor
-    starts: tuple[int, ...]
-    source_count: int
-    target_count: int
-    identity: int | None = None
+    side: int
+    step: int
+    keys: tuple[Tensor, Tensor]
     turned: bool = False
-    kept: dict[str, Tensor] = field(default_factory=dict, repr=False)
+    kept: dict[str, Any] = field(default_factory=dict, repr=False)
+
+    @property
+    def device(self) -> torch.device:
+        return self.keys[0].device
+
+    @property
+    def source_count(self) -> int:
+        """Rows that are read."""
+        return len(self.keys[1 if self.turned else 0])
+
+    @property
+    def target_count(self) -> int:
+        """Rows that are written."""
+        return len(self.keys[0 if self.turned else 1])
 
     @property
     def offsets(self) -> int:
-        return len(self.starts) - 1
+        return self.side**3
+
+    @property
+    def symmetric(self) -> bool:
+        """Whether offset K^3 - 1 - k is minus offset k, between the same voxels."""
+        return self.keys[0] is self.keys[1] and self.side % 2 == 1
+
+    @property
+    def identity(self) -> int | None:
+        """Offset that connects every voxel with itself and has no pairs; None if there is none."""
+        return self.offsets // 2 if self.symmetric else None
+
+    @property
+    def _pairs(self) -> tuple[Tensor, Tensor, tuple[int, ...]]:
+        """Rows of either side before the map was turned, offset by offset, and where those of each offset begin."""
+        if "pairs" not in self.kept:
+            self.kept["pairs"] = _list_pairs(self)
+        pairs: tuple[Tensor, Tensor, tuple[int, ...]] = self.kept["pairs"]
+        return pairs
+
+    @property
+    def sources(self) -> Tensor:
+        """Row that is read, int64 [pairs]."""
+        return self._pairs[1 if self.turned else 0]
+
+    @property
+    def targets(self) -> Tensor:
+        """Row that is written, int64 [pairs]; no row twice within an offset."""
+        return self._pairs[0 if self.turned else 1]
+
+    @property
+    def starts(self) -> tuple[int, ...]:
+        """First pair of each of the K^3 offsets, and the number of pairs."""
+        return self._pairs[2]
 
     @property
     def pairs(self) -> int:
@@ -123,39 +169,32 @@ class KernelMap:
 
     def swapped(self) -> KernelMap:
         """The map of the transposed convolution: the same offsets, read and written the other way round."""
-        counts = self.target_count, self.source_count
-        return KernelMap(self.targets, self.sources, self.starts, *counts, self.identity, not self.turned, self.kept)
+        return replace(self, turned=not self.turned)
 
-    @property
-    def sources_of_targets(self) -> Tensor:
-        """Source of every target at each offset, -1 where it has none, int32 [K^3, M]; made once for both directions.
+    def table(self, by_target: bool) -> tuple[Tensor, bool]:
+        """Source of every target at each offset, or target of every source; -1 where there is none.
 
-        The identity has no pairs, so that its row is empty.
+        Returns:
+            int32 [K^3, rows], empty if the identity is the only offset; and whether its rows belong to the offsets in
+            reverse, as they do where one table of a symmetric map serves both ways.
         """
-        if "by target" not in self.kept:
-            self.kept.update(_tables(self))
-        return self.kept["by source" if self.turned else "by target"]
-
-    @property
-    def starts_on_device(self) -> Tensor:
-        """`starts` beside the pairs, int32 [K^3 + 1]."""
-        if "starts" not in self.kept:
-            self.kept["starts"] = torch.tensor(self.starts, dtype=torch.int32).to(self.sources.device)
-        return self.kept["starts"]
+        if "tables" not in self.kept:
+            self.kept["tables"] = _tables(self)
+        first = by_target != self.turned
+        tables: list[Tensor] = self.kept["tables"]
+        return tables[0 if first or self.symmetric else 1], self.symmetric and not first
 
 
-def _tables(pairs: KernelMap) -> dict[str, Tensor]:
-    """Sources by target and targets by source of a map, named as they are before it is turned."""
-    device, offsets = pairs.sources.device, pairs.offsets
-    filled = torch.full((offsets * (pairs.target_count + pairs.source_count),), -1, dtype=torch.int32, device=device)
-    by_target, by_source = filled.split([offsets * pairs.target_count, offsets * pairs.source_count])
-    by_target, by_source = by_target.view(offsets, -1), by_source.view(offsets, -1)
-    starts = torch.tensor(pairs.starts, dtype=torch.int32).to(device)
-    inputs = [view(pairs.sources, wp.int64), view(pairs.targets, wp.int64), view(starts, wp.int32)]
-    outputs = [view(by_target, wp.int32), view(by_source, wp.int32)]
-    launch_plain(convolution_block.tabulate_pairs, len(pairs.sources), inputs, outputs, device=device)
-    tables = (by_source, by_target) if pairs.turned else (by_target, by_source)
-    return {"by target": tables[0], "by source": tables[1], "starts": starts}
+def _tables(pairs: KernelMap) -> list[Tensor]:
+    """Source of every target before the map was turned; and, if it is not symmetric, target of every source."""
+    sources, targets = pairs.keys
+    offsets = 0 if pairs.identity == 0 else pairs.offsets
+    counts = [len(targets), 0 if pairs.symmetric else len(sources)]
+    tables = [torch.empty(offsets, count, dtype=torch.int32, device=pairs.device) for count in counts]
+    inputs = [pairs.side, pairs.step, view(sources, wp.int64), view(targets, wp.int64)]
+    outputs = [view(table, wp.int32) for table in tables]
+    launch_plain(voxels.tabulate_neighbors, (offsets, sum(counts)), inputs, outputs, device=pairs.device)
+    return tables
 
 
 def kernel_map(sources: Tensor, targets: Tensor, side: int, step: int = 1) -> KernelMap:
@@ -164,7 +203,7 @@ def kernel_map(sources: Tensor, targets: Tensor, side: int, step: int = 1) -> Ke
     Args:
         sources: Sorted unique keys of the voxels that are read, int64 [N].
         targets: Sorted unique keys of the voxels that are written, int64 [M]; the same tensor for a convolution
-            without stride, of whose map half is searched and half mirrored.
+            without stride, of whose pairs half are searched and half mirrored.
         side: K of the K^3 kernel.
         step: Between neighbouring offsets: tensor stride times dilation [voxels].
 
@@ -175,23 +214,25 @@ def kernel_map(sources: Tensor, targets: Tensor, side: int, step: int = 1) -> Ke
     reach = step * max(side // 2, side - 1 + first)
     if side < 1 or step < 1 or reach > MARGIN:
         raise InputError(f"a kernel of side {side} and step {step} reaches {reach} voxels; at most {MARGIN} may be")
-    along = [step * (first + i) for i in range(side)]
+    return KernelMap(side, step, (sources, targets))
+
+
+def _list_pairs(pairs: KernelMap) -> tuple[Tensor, Tensor, tuple[int, ...]]:
+    """Rows of sources and of targets, offset by offset, and where each offset begins."""
+    (sources, targets), side = pairs.keys, pairs.side
+    first = -(side // 2) if side % 2 else 0
+    along = [pairs.step * (first + i) for i in range(side)]
     steps = [(x << 2 * AXIS_BITS) + (y << AXIS_BITS) + z for z, y, x in itertools.product(along, repeat=3)]
-    if sources is not targets or side % 2 == 0 or side == 1:
+    if not pairs.symmetric:
         found, written, counts = _merge(sources, targets, steps)
-        return KernelMap(found, written, _starts(counts), len(sources), len(targets))
+        return found, written, _starts(counts)
     # Offset K^3 - 1 - k is minus offset k: its pairs are those of k the other way round.
-    half = len(steps) // 2
-    found, written, counts = _merge(sources, targets, steps[:half])
+    found, written, counts = _merge(sources, targets, steps[: len(steps) // 2])
+    if not counts:  # the identity alone
+        return found, written, (0, 0)
     mirror_found, mirror_written = (torch.cat(rows.split(counts)[::-1]) for rows in (written, found))
-    return KernelMap(
-        torch.cat([found, mirror_found]),
-        torch.cat([written, mirror_written]),
-        _starts([*counts, 0, *reversed(counts)]),
-        len(sources),
-        len(targets),
-        identity=half,
-    )
+    starts = _starts([*counts, 0, *reversed(counts)])
+    return torch.cat([found, mirror_found]), torch.cat([written, mirror_written]), starts
 
 
 def _starts(counts: list[int]) -> tuple[int, ...]:

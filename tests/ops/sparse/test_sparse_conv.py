@@ -9,7 +9,7 @@ from sgwarp.errors import InputError
 from sgwarp.ops.launcher import get_threads, set_threads
 from sgwarp.ops.reference import convolution as reference_sparse
 from sgwarp.ops.sparse.convolution import sparse_conv
-from sgwarp.ops.sparse.voxels import KernelMap, coarsen, kernel_map, pack_voxels, unpack_voxels
+from sgwarp.ops.sparse.voxels import coarsen, kernel_map, pack_voxels, unpack_voxels
 
 # side, step of the kernel, stride of the target voxels
 CASES = [(3, 1, 1), (5, 1, 1), (3, 2, 1), (1, 1, 1), (2, 1, 2), (3, 1, 2), (2, 1, 1)]
@@ -286,5 +286,7 @@ def test_convolution_is_that_of_spconv(kind, side, stride):
 
 
 def test_a_map_counts_its_pairs():
-    pairs = KernelMap(torch.tensor([0]), torch.tensor([1]), (0, 1, 1, 1), 2, 2, identity=1)
-    assert (pairs.offsets, pairs.pairs) == (3, 3)
+    keys = pack_voxels(torch.tensor([[0, 0, 0, 0], [0, 0, 0, 1], [0, 7, 7, 7]]))
+    pairs = kernel_map(keys, keys, 3)
+    assert (pairs.offsets, pairs.identity, pairs.pairs) == (27, 13, 5)
+    assert (pairs.starts[13], pairs.starts[14], pairs.starts[27]) == (1, 1, 2)

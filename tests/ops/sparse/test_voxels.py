@@ -139,11 +139,34 @@ def test_maps_with_stride_and_their_transpose(side):
         assert down.pairs == len(keys)  # every fine voxel lies in exactly one coarse one
 
 
+def pairs_of_table(map_, by_target: bool) -> list[set[tuple[int, int]]]:
+    """(source, target) of each offset, as a table has them."""
+    table, mirrored = map_.table(by_target)
+    rows = table.flip(0) if mirrored else table
+    found = [{(e, row) for row, e in enumerate(offset.tolist()) if e >= 0} for offset in rows]
+    return found if by_target else [{(row, e) for e, row in offset} for offset in found]
+
+
+@pytest.mark.parametrize(("side", "step", "stride"), [(3, 1, 1), (5, 2, 1), (2, 1, 1), (2, 1, 2), (3, 1, 2), (2, 4, 4)])
+def test_tables_are_those_of_a_dictionary(side, step, stride):
+    """Of the map and of its transpose; a symmetric one has one table for both, read backwards."""
+    keys = voxels(300, 5 * step)
+    targets = keys if stride == 1 else coarsen(keys, stride)
+    map_ = kernel_map(keys, targets, side, step)
+    expected = pairs_by_dictionary(keys, targets, side, step)
+    turned = [{(target, source) for source, target in offset} for offset in expected]
+    for by_target in (True, False):
+        assert pairs_of_table(map_, by_target) == expected
+        assert pairs_of_table(map_.swapped(), by_target) == turned
+    assert len(map_.kept["tables"]) == 2
+
+
 def test_maps_at_the_border_of_the_range_do_not_wrap_around():
     """A carry into the next field would connect opposite ends of the range."""
     ends = torch.tensor([[0, 0, 0, EDGE], [0, 0, 1, -EDGE], [0, 1, -EDGE, -EDGE], [0, 0, EDGE, EDGE], [1, -EDGE, 0, 0]])
     keys = pack_voxels(ends).unique()
     assert kernel_map(keys, keys, 3, MARGIN).pairs == len(keys)
+    assert int((kernel_map(keys, keys, 3, MARGIN).table(by_target=True)[0] >= 0).sum()) == len(keys)
     with pytest.raises(InputError, match="reaches"):
         kernel_map(keys, keys, 5, MARGIN)
 

@@ -1,0 +1,110 @@
+"""Host side of the block schedule of sparse convolutions: single precision, one launch each."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import torch
+import warp as wp
+from torch import Tensor
+
+from sgwarp.kernels.sparse import convolution_block as kernels
+from sgwarp.ops.launcher import counters, launch_blocks, scratch, view
+from sgwarp.ops.sparse.voxels import KernelMap
+
+MAX_OFFSETS = kernels.MAX_OFFSETS
+BUSY_BLOCKS, MAX_SHARES = 1024, 16  # of a gradient of the weights: a large GPU has 132 multiprocessors
+
+
+class Running(NamedTuple):
+    """Running statistics of a batch normalisation, [C], which a batch changes; and how."""
+
+    mean: Tensor
+    variance: Tensor
+    epsilon: float
+    momentum: float
+
+
+def fits_blocks(dtype: torch.dtype, kernel_map: KernelMap, schedule: str | None) -> bool:
+    """Whether the kernels of the block schedule take it: on CUDA, all but double precision and very large kernels."""
+    on_cuda = kernel_map.device.type == "cuda" if schedule is None else schedule == "block"
+    return on_cuda and dtype != torch.float64 and kernel_map.offsets <= MAX_OFFSETS
+
+
+def parts_of(count: int, size: int) -> int:
+    """How many parts of this size it takes."""
+    return -(-count // size)
+
+
+def rows_of(matrix: Tensor) -> Tensor:
+    """The matrix where each row is one piece of memory, as kernels want it; a copy only if it is not so yet."""
+    rows, columns = matrix.shape
+    apart = matrix.stride(0) >= columns or rows < 2
+    return matrix if apart and (matrix.stride(1) == 1 or columns < 2) else matrix.contiguous()
+
+
+def convolve(
+    features: Tensor, weight: Tensor, kernel_map: KernelMap, running: Running | None = None
+) -> tuple[Tensor, Tensor]:
+    """y, [M, C_out], and with `running`, which it changes, the statistics of y: mean, rest of the mean and inverse
+    deviation, [3, C_out]; at least two rows."""
+    outputs, device = weight.shape[2], features.device
+    y = torch.empty(kernel_map.target_count, outputs, device=device)
+    statistics = torch.empty(0 if running is None else 3, outputs, device=device)
+    if not y.numel():
+        return y, statistics
+    table, mirrored = kernel_map.table(by_target=True)
+    grid = [parts_of(len(y), kernels.TARGETS), parts_of(outputs, kernels.CHANNELS)]
+    moments = scratch("sparse moments", 2 * grid[0] * outputs if running else 0, torch.float64, device)
+    mean, variance, epsilon, momentum = running or (y.new_empty(0), y.new_empty(0), 0.0, 0.0)
+    inputs = [view(rows_of(features), wp.float32), view(weight, wp.float32), view(table, wp.int32), int(mirrored)]
+    inputs += [_identity(kernel_map), epsilon, momentum, view(moments, wp.float64)]
+    inputs.append(view(counters(grid[1], device), wp.int32))
+    outs = [view(tensor, wp.float32) for tensor in (y, statistics, mean, variance)]
+    launch_blocks(kernels.convolve_blocks, grid, inputs, outs, device=device)
+    return y, statistics
+
+
+def gradients(
+    features: Tensor,
+    grad: Tensor,
+    weight: Tensor,
+    kernel_map: KernelMap,
+    wanted: tuple[bool, bool] = (True, True),
+    addend: Tensor | None = None,
+) -> tuple[Tensor | None, Tensor | None]:
+    """Gradients of the features, with `addend` added to it, and of the weight; those that are wanted, in one launch."""
+    device, (offsets, inputs, outputs) = features.device, weight.shape
+    v_features = features.new_empty(kernel_map.source_count, inputs) if wanted[0] else None
+    v_weight = weight.new_empty(weight.shape) if wanted[1] else None
+    across = parts_of(inputs, kernels.CHANNELS)
+    feature_blocks = 0 if v_features is None else parts_of(len(v_features), kernels.TARGETS) * across
+    pieces = 0 if v_weight is None else offsets * across * parts_of(outputs, kernels.CHANNELS)
+    shares = max(1, min(BUSY_BLOCKS // max(pieces, 1), MAX_SHARES))
+    blocks = feature_blocks + pieces * shares
+    if not blocks:
+        return v_features, v_weight
+    (table, mirrored), identity = kernel_map.table(by_target=False), _identity(kernel_map)
+    # The table of the side that has fewer voxels has fewer gaps.
+    by_source = kernel_map.source_count < kernel_map.target_count
+    walked, reverse = kernel_map.table(by_target=not by_source)
+    if reverse:
+        by_source = not by_source
+        walked, _ = kernel_map.table(by_target=not by_source)
+    partial = scratch("sparse shares", shares * weight.numel() if shares > 1 else 0, torch.float32, device)
+    nothing = features.new_empty(0, 0)
+    added = nothing if addend is None else rows_of(addend)
+    arguments = [view(rows_of(tensor), wp.float32) for tensor in (features, grad)]
+    arguments += [view(weight, wp.float32), view(table, wp.int32), int(mirrored), identity, view(added, wp.float32)]
+    arguments += [feature_blocks, view(walked, wp.int32), int(by_source), shares, view(partial, wp.float32)]
+    arguments.append(view(counters(pieces, device), wp.int32))
+    outs = [
+        view(nothing if v_features is None else v_features, wp.float32),
+        view(nothing[None] if v_weight is None else v_weight, wp.float32),
+    ]
+    launch_blocks(kernels.convolve_backward_blocks, [blocks], arguments, outs, device=device)
+    return v_features, v_weight
+
+
+def _identity(kernel_map: KernelMap) -> int:
+    return -1 if kernel_map.identity is None else kernel_map.identity

@@ -1,0 +1,194 @@
+"""A convolution with what follows it in a residual network, block schedule (CUDA): normalisation, shortcut, maximum.
+
+z = max(0, (y - mean) / sqrt(variance + epsilon) gain + bias + shortcut) of y, the convolution of x, and beside z
+further channels of the same voxels. Two launches with gradients to follow, three for all gradients, and one for
+inference.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import Any
+
+import torch
+import warp as wp
+from torch import Tensor
+from torch.autograd.function import once_differentiable
+
+from sgwarp.kernels.sparse import convolution_block, normalization_block
+from sgwarp.ops.launcher import counters, launch_blocks, launch_plain, scratch, view
+from sgwarp.ops.sparse.blocks import Running, convolve, gradients, parts_of, rows_of
+from sgwarp.ops.sparse.voxels import KernelMap
+
+ROWS, MAX_PARTS = 128, 256  # of a sum over all voxels: rows of a block at least, and blocks at most
+
+
+@dataclass(frozen=True, eq=False)
+class Normalization:
+    """A batch normalisation with its affine map.
+
+    Attributes:
+        gain, bias: [C]; may want gradients.
+        running: Its running statistics.
+        learns: Whether to normalise by the statistics of the rows, of which there are two or more, and to let them into
+            the running ones.
+        rectified: Whether what is negative becomes zero in the end.
+    """
+
+    gain: Tensor
+    bias: Tensor
+    running: Running
+    learns: bool
+    rectified: bool = True
+
+    @property
+    def least(self) -> float:
+        return 0.0 if self.rectified else -math.inf
+
+
+def convolve_and_normalize(
+    features: Tensor,
+    weight: Tensor,
+    kernel_map: KernelMap,
+    norm: Normalization,
+    shortcut: Tensor | None = None,
+    beside: Tensor | None = None,
+) -> tuple[Tensor, Tensor]:
+    """A layer, all of it float32.
+
+    Args:
+        features: x, [N, C_in].
+        weight: W, [K^3, C_in, C].
+        kernel_map: From the N rows to M.
+        norm: What follows.
+        shortcut: Added before the maximum is taken, [M, C].
+        beside: Channels that are copied behind those of the result, [M, S].
+
+    Returns:
+        z, [M, C + S], and x: who goes on with this x instead of the one that was given spares its gradient an addition.
+    """
+    tensors = (features, weight, norm.gain, norm.bias, shortcut, beside)
+    if torch.is_grad_enabled() and any(t is not None and t.requires_grad for t in tensors):
+        z, through = _Layer.apply(*tensors, kernel_map, norm)
+        return z, through
+    if not norm.learns:
+        return _infer(features, weight, kernel_map, norm, shortcut, beside), features
+    return _learn(features, weight, kernel_map, norm, shortcut, beside)[0], features
+
+
+def _infer(
+    features: Tensor,
+    weight: Tensor,
+    kernel_map: KernelMap,
+    norm: Normalization,
+    shortcut: Tensor | None,
+    beside: Tensor | None,
+) -> Tensor:
+    """z by the running statistics, in one launch."""
+    channels, further = weight.shape[2], 0 if beside is None else beside.shape[1]
+    z = features.new_empty(kernel_map.target_count, channels + further)
+    if not z.numel():
+        return z
+    grid = [parts_of(len(z), convolution_block.TARGETS)]
+    grid.append(sum(parts_of(n, convolution_block.CHANNELS) for n in (channels, further)))
+    table, mirrored = kernel_map.table(by_target=True)
+    nothing, running = features.new_empty(0, 0), norm.running
+    inputs = [view(rows_of(features), wp.float32), view(weight, wp.float32), view(table, wp.int32), int(mirrored)]
+    inputs.append(-1 if kernel_map.identity is None else kernel_map.identity)
+    inputs += [*(view(t, wp.float32) for t in (running.mean, running.variance)), running.epsilon]
+    inputs += [view(t, wp.float32) for t in (norm.gain, norm.bias)]
+    inputs += [view(nothing if shortcut is None else rows_of(shortcut), wp.float32), norm.least]
+    inputs.append(view(nothing if beside is None else rows_of(beside), wp.float32))
+    outputs = [view(z, wp.float32)]
+    launch_blocks(convolution_block.convolve_and_finish_blocks, grid, inputs, outputs, device=z.device)
+    return z
+
+
+def _learn(
+    features: Tensor,
+    weight: Tensor,
+    kernel_map: KernelMap,
+    norm: Normalization,
+    shortcut: Tensor | None,
+    beside: Tensor | None,
+) -> tuple[Tensor, Tensor, Tensor]:
+    """z, y and the statistics, in two launches."""
+    running = norm.running
+    y, statistics = convolve(features, weight, kernel_map, running if norm.learns else None)
+    if norm.learns:
+        for changed in (running.mean, running.variance):
+            if not changed.is_inference():
+                torch.autograd.graph.increment_version(changed)
+    else:
+        inverse = torch.rsqrt(running.variance + running.epsilon)
+        statistics = torch.stack([running.mean, torch.zeros_like(running.mean), inverse])
+    further = 0 if beside is None else beside.shape[1]
+    z = y.new_empty(len(y), y.shape[1] + further)
+    nothing = y.new_empty(0, 0)
+    inputs = [view(t, wp.float32) for t in (y, statistics, norm.gain, norm.bias)]
+    inputs += [view(nothing if shortcut is None else rows_of(shortcut), wp.float32), norm.least]
+    inputs.append(view(nothing if beside is None else rows_of(beside), wp.float32))
+    kernel, outputs = normalization_block.normalize_elements, [view(z, wp.float32)]
+    launch_plain(kernel, (z.shape[0], z.shape[1]), inputs, outputs, device=z.device)
+    return z, y, statistics
+
+
+class _Layer(torch.autograd.Function):
+    @staticmethod
+    def forward(
+        ctx: Any,
+        features: Tensor,
+        weight: Tensor,
+        gain: Tensor,
+        bias: Tensor,
+        shortcut: Tensor | None,
+        beside: Tensor | None,
+        kernel_map: KernelMap,
+        norm: Normalization,
+    ) -> tuple[Tensor, Tensor]:
+        ctx.set_materialize_grads(False)
+        z, y, statistics = _learn(features, weight, kernel_map, norm, shortcut, beside)
+        ctx.save_for_backward(features, weight, gain, y, statistics, z)
+        ctx.kernel_map, ctx.learns, ctx.rectified = kernel_map, norm.learns, norm.rectified
+        return z, features.view_as(features)
+
+    @staticmethod
+    @once_differentiable
+    def backward(ctx: Any, grad: Tensor | None, through: Tensor | None) -> tuple[Tensor | None, ...]:
+        if grad is None:
+            return (through, *[None] * 7)
+        features, weight, gain, y, statistics, z = ctx.saved_tensors
+        for_features, for_weight, for_gain, for_bias, for_shortcut, for_beside = ctx.needs_input_grad[:6]
+        channels, grad = y.shape[1], rows_of(grad)
+        v_bias, v_gain = ((y.new_empty if len(y) else y.new_zeros)(channels) for _ in range(2))
+        known = [view(grad, wp.float32), view(z, wp.float32), int(ctx.rectified)]
+        known += [view(t, wp.float32) for t in (y, statistics)]
+        if len(y) and (ctx.learns or for_gain or for_bias):
+            per_part = max(ROWS, parts_of(len(y), MAX_PARTS))
+            grid = [parts_of(len(y), per_part), parts_of(channels, convolution_block.CHANNELS)]
+            partial = scratch("sparse sums", 2 * grid[0] * channels, torch.float64, y.device)
+            inputs = [*known, per_part, view(partial, wp.float64), view(counters(grid[1], y.device), wp.int32)]
+            kernel, outputs = normalization_block.sum_normalized_blocks, [view(t, wp.float32) for t in (v_bias, v_gain)]
+            launch_blocks(kernel, grid, inputs, outputs, device=y.device)
+        v_features = v_weight = v_shortcut = None
+        if for_features or for_weight or for_shortcut:
+            v_y = torch.empty_like(y)
+            v_shortcut = torch.empty_like(y) if for_shortcut else None
+            share = 1.0 / len(y) if ctx.learns else 0.0
+            inputs = [*known, *(view(t, wp.float32) for t in (gain, v_bias, v_gain)), share]
+            outputs = [view(t, wp.float32) for t in (v_y, y.new_empty(0, 0) if v_shortcut is None else v_shortcut)]
+            kernel = normalization_block.normalize_backward_elements
+            launch_plain(kernel, (len(y), channels), inputs, outputs, device=y.device)
+            wanted = for_features, for_weight
+            v_features, v_weight = gradients(features, v_y, weight, ctx.kernel_map, wanted, through)
+        return (
+            v_features,
+            v_weight,
+            v_gain if for_gain else None,
+            v_bias if for_bias else None,
+            v_shortcut,
+            grad[:, channels:] if for_beside else None,
+            None,
+            None,
+        )
