@@ -1,6 +1,5 @@
 """What the helpers that commands share pass on: settings of poses, and which encoder of phrases is asked for."""
 
-import numpy as np
 import pytest
 
 from sgwarp.io.store import save_semantics
@@ -89,19 +88,3 @@ def test_phrases_are_for_the_encoder_of_the_lift_or_the_one_that_is_named(stoppe
     assert all(templates is None for templates in call[3:])
     if name != "instances":
         assert stopped(target, *words, "--encoder", "clip:other").positional[:3] == ("toy", "clip:other", "cpu")
-
-
-def test_depth_of_floats_is_in_meters_and_of_whole_numbers_in_the_unit(stage, tmp_path):
-    """Of whichever file: PNG, integers in NPY, and NPY of any floating point type."""
-    from sgwarp.files.images import write_ids
-    from sgwarp.reconstruction.fitting.belongings import depth_from_folder
-
-    shape = stage.views[0].camera.size
-    np.save(tmp_path / "0000.npy", np.full(shape, 2.5, np.float32))
-    np.save(tmp_path / "0001.npy", np.full(shape, 2.5, np.float64))
-    np.save(tmp_path / "0002.npy", np.full(shape, 2500, np.uint16))
-    np.save(tmp_path / "0003.npy", np.full(shape, 2500, np.int64)[..., None])
-    write_ids(tmp_path / "0004.png", np.full(shape, 2500, np.uint16))
-    depth = depth_from_folder(tmp_path, stage.views)
-    for view in stage.views[:5]:
-        np.testing.assert_allclose(depth(view), 2.5, rtol=1e-6)
