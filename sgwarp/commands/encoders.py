@@ -37,13 +37,13 @@ class Encoders:
                     "installed": not kind.missing,
                     "install": f'pip install "sgwarp[{kind.extra}]"' if kind.extra else None,
                 }
-                for kind in KINDS
+                for kind in KINDS.values()
             ]
             print(json.dumps(facts, indent=2))
             return
         for role, title in ROLES.items():
             print(f"{title}")
-            for kind in (kind for kind in KINDS if kind.role == role):
+            for kind in (kind for kind in KINDS.values() if kind.role == role):
                 state = f'needs: pip install "sgwarp[{kind.extra}]"' if kind.missing else "installed"
                 print(f"  {kind.name:12} {kind.about} ({state})")
                 print(f"  {'':12} --encoder '{kind.example}'")

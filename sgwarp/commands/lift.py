@@ -98,10 +98,10 @@ class Lift(SceneOptions):
 
             gaussians = self.load_scene(log)
             source = parse(self.encoder)[0].source
-            if source.kind.name == "openscene":
-                from sgwarp.io.openscene import load_openscene
+            if source.kind.fused:
+                from sgwarp.encoders.building import builder
 
-                semantics = load_openscene(source.argument, gaussians, source.options.get("space"))
+                semantics = builder(source.kind.fused)(source.argument, gaussians, source.options.get("space"))
                 log.error["coverage"] = semantics.coverage
                 notes: dict[str, Any] = {"encoder": self.encoder}
             else:

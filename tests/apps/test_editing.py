@@ -407,6 +407,16 @@ def test_scattered_pieces_are_left_out(stage):
     assert torch.equal(largest_pieces(stage.gaussians.means, both), both), "two large pieces both stay"
 
 
+@pytest.mark.parametrize(("sizes", "kept"), [((40, 5), 2), ((40, 4), 2), ((40, 3), 1), ((20, *[3] * 9), 10)])
+def test_a_piece_is_compared_with_the_largest_one(sizes, kept):
+    """A tenth of the largest piece is enough, however many there are."""
+    rows = [torch.arange(size).float()[:, None] * 0.1 + 100.0 * k for k, size in enumerate(sizes)]
+    means = torch.nn.functional.pad(torch.cat(rows), (0, 2))
+    chosen = largest_pieces(means, torch.ones(len(means), dtype=torch.bool))
+    assert [bool(part.all()) for part in chosen.split(list(sizes))] == [k < kept for k in range(len(sizes))]
+    assert int(chosen.sum()) == sum(sizes[:kept])
+
+
 @pytest.mark.parametrize("count", [2, 3, 40])
 def test_pieces_of_few_gaussians(count):
     """Evenly spaced on a line they are one piece; the last, far away and not chosen, is in none."""

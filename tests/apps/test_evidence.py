@@ -316,3 +316,17 @@ def test_mean_features_are_weighted_with_the_confidence():
     total = 10 / 11 + 2 / 3
     mean = torch.tensor([[10 / 11 / total, 2 / 3 / total, 0.0]])
     torch.testing.assert_close(mean_features(found, semantics), mean)
+
+
+def test_doubts_look_at_the_features_of_their_own_level():
+    """Two parts that look alike, and two wholes that do not; nothing was compared."""
+    place = [(1, "s"), (2, "s"), (3, "l"), (4, "l")]
+    table = [
+        Instance(k, level, 0, 9, 1, 1, 1.0, (0.1 * k, 0.0, 0.0), (1.0, 0.0, 0.0, 0.0), (1.0, 1.0, 1.0))
+        for k, level in place
+    ]
+    once, no = np.ones(2, np.int64), np.zeros((2, 2), bool)
+    facts = [GroupFacts(once, once, no, no, ("", ""), np.ones(2))] * 2
+    alike, apart = torch.tensor([[1.0, 0.0], [1.0, 0.1]]), torch.eye(2)
+    for features, may_be in (((alike, apart), [(2,), (1,), (), ()]), ((apart, alike), [(), (), (4,), (3,)])):
+        assert [row.may_be for row in find_doubts(table, facts, torch.cat(features))] == may_be

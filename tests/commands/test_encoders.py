@@ -41,14 +41,14 @@ def run(*arguments) -> int:
 def test_every_source_is_listed(capsys):
     assert run("encoders") == 0
     text = capsys.readouterr().out
-    for kind in KINDS:
+    for kind in KINDS.values():
         assert f"  {kind.name:12} {kind.about} (" in text
         assert f"--encoder '{kind.example}'" in text
     for role in ("image level: sees one region", "pixel level: features for every pixel", "instance level: finds"):
         assert text.count(role) == 1
     assert run("encoders", "--json") == 0
     facts = {row["name"]: row for row in json.loads(capsys.readouterr().out)}
-    assert facts.keys() == {kind.name for kind in KINDS}
+    assert facts.keys() == set(KINDS)
     assert facts["conse"]["install"] == 'pip install "sgwarp[conse]"'
     assert facts["files"]["installed"]
     assert facts["sam"]["options"][0] == "points"

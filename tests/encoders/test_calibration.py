@@ -55,7 +55,7 @@ def test_spaces_find_their_row_of_the_catalogue():
     assert calibration_of_space("mine") is PAPER
     joint = "clip-512-1f0c@0.3333 ++ conse-efficientnet-lite2-minilm-512@0.6667"
     assert calibration_of_space(joint) is CONSE
-    assert {kind.name for kind in KINDS if kind.calibration} == {"conse", "clip", "siglip", "siglip2", "lseg"}
+    assert {kind.name for kind in KINDS.values() if kind.calibration} == {"conse", "clip", "siglip", "siglip2", "lseg"}
 
 
 def test_scorings_are_those_of_the_guide():

@@ -41,3 +41,28 @@ def test_files_are_never_kept(made):
     registry.keep_encoders()
     assert registry.make_encoder("files:labels") is not registry.make_encoder("files:labels")
     assert len(made) == 2
+
+
+def test_text_sides_are_kept_for_all_that_they_depend_on(monkeypatch):
+    """Name, device and templates; what is asked for again is the same object."""
+    monkeypatch.setattr(registry, "_kept", None)
+    monkeypatch.setattr(registry, "make_text_encoder", lambda name, device, templates: Side())
+    asked = [
+        ("a", "cpu", None),
+        ("b", "cpu", None),
+        ("a", "cuda", None),
+        ("a", "cpu", ("plain",)),
+        ("a", "cpu", ("{}",)),
+    ]
+    assert registry.text_encoder_for("toy", *asked[0]) is not registry.text_encoder_for("toy", *asked[0])
+    registry.keep_encoders()
+    made = [registry.text_encoder_for("toy", *one) for one in asked]
+    assert len({id(side) for side in made}) == len(asked)
+    assert [registry.text_encoder_for("toy", *one) for one in asked] == made
+
+
+class Side:
+    space = "toy"
+
+    def encode_text(self, texts):
+        raise AssertionError("not asked")

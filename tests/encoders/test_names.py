@@ -13,7 +13,7 @@ import torch
 from sgwarp.encoders import catalogue
 from sgwarp.encoders.building import builder
 from sgwarp.encoders.cache import CachedMaps
-from sgwarp.encoders.catalogue import BY_NAME, KINDS
+from sgwarp.encoders.catalogue import KINDS
 from sgwarp.encoders.compose import Crops, MaskedImages, PaintedInstances, PlainPixels, RefinedPixels
 from sgwarp.encoders.ensemble import Ensemble
 from sgwarp.encoders.images.clip import JointEncoder
@@ -28,7 +28,7 @@ from sgwarp.errors import InputError
 
 
 def builders() -> set[str]:
-    return {path for kind in KINDS for path in (kind.make, kind.speak) if path}
+    return {path for kind in KINDS.values() for path in (kind.make, kind.speak) if path}
 
 
 @pytest.mark.parametrize("path", sorted(builders()))
@@ -67,7 +67,7 @@ def test_members():
     assert third.text == "clip:d"
 
 
-@pytest.mark.parametrize("kind", KINDS, ids=lambda kind: kind.name)
+@pytest.mark.parametrize("kind", KINDS.values(), ids=lambda kind: kind.name)
 def test_every_example_is_a_name(kind):
     (member,) = parse(kind.example)
     assert kind.name in {member.source.kind.name, member.masks.kind.name if member.masks else ""}
@@ -182,12 +182,12 @@ def test_what_is_installed(monkeypatch):
     monkeypatch.setattr(
         catalogue, "find_spec", lambda name: None if name == "tensorflow" else importlib.util.find_spec("os")
     )
-    assert BY_NAME["openseg"].missing == ["tensorflow"]
-    assert BY_NAME["lseg"].missing == []
-    assert BY_NAME["graph"].missing == []
+    assert KINDS["openseg"].missing == ["tensorflow"]
+    assert KINDS["lseg"].missing == []
+    assert KINDS["graph"].missing == []
 
 
-@pytest.mark.parametrize("kind", KINDS, ids=lambda kind: kind.name)
+@pytest.mark.parametrize("kind", KINDS.values(), ids=lambda kind: kind.name)
 def test_a_row_carries_its_builder(kind):
     """In the folder of its role; nothing else has to know an encoder."""
     made = "make_masks" if kind.role == "masks" else "make_source"

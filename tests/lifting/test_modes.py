@@ -9,7 +9,7 @@ import torch
 
 from sgwarp.commands.lift import Lift
 from sgwarp.errors import InputError
-from sgwarp.lifting import lifter, ridge, robust
+from sgwarp.lifting import lifter, map_reader, ridge, robust
 from sgwarp.lifting.holes import TRUST, fill_holes
 from sgwarp.lifting.lifter import lift
 from sgwarp.lifting.reliability import LEAST, from_residuals
@@ -135,6 +135,69 @@ def test_conjugate_gradients_against_numpy():
     assert not np.allclose(once, solved)
 
 
+WORTH = {"0": 1.0, "1": 0.25, "2": 0.04, "3": 0.6, "4": 0.01}
+
+
+@pytest.mark.parametrize("mode", ["weighted", "squared", "robust", "solve"])
+def test_what_a_view_is_worth_counts_in_every_mode(scene, mode, monkeypatch):
+    """Against the means, Weiszfeld's iteration and the ridge solution with the views' factors in them."""
+    gaussians, views, maps, matrices = scene
+    monkeypatch.setattr(lifter, "view_reliabilities", lambda *rest: WORTH)
+    settings = LiftSettings(reliability=True, passes=3, smoothing=0.05, ridge=0.3, iterations=200)
+    lifted = lift(gaussians, views, maps, mode, lift_settings=settings)
+    means, weights = weighted_means(scene, mode)
+    worth = np.array([WORTH[view.stem] for view in views])[:, None]
+    weights = worth * weights
+    total = weights.sum(axis=0)
+    x = (means * weights[..., None]).sum(axis=0) / np.where(total > 0, total, 1)[:, None]
+    if mode == "solve":
+        K, right = 0.3 * np.eye(len(gaussians)), 0.3 * x
+        for view, A in zip(views, matrices, strict=True):
+            f, valid = targets(maps[view.stem])
+            K += WORTH[view.stem] * A.T @ (valid[:, None] * A)
+            right += WORTH[view.stem] * A.T @ (valid[:, None] * f)
+        x = np.linalg.solve(K, right)
+    for _ in range(3 if mode == "robust" else 0):
+        factor = weights / np.maximum(np.linalg.norm(x - means, axis=2), 0.05)
+        divisor = factor.sum(axis=0)
+        x = (factor[..., None] * means).sum(axis=0) / np.where(divisor > 0, divisor, 1)[:, None]
+    clear = total > 1e-2
+    np.testing.assert_allclose(lifted.features[clear], x[clear], atol=3e-3)
+    np.testing.assert_allclose(lifted.weight, total, rtol=2e-3, atol=1e-4)
+    squares = (weights**2).sum(axis=0)
+    views_behind = total**2 / np.where(squares > 0, squares, 1)
+    np.testing.assert_allclose(lifted.effective_views[clear], views_behind[clear], rtol=5e-3)
+
+
+@pytest.mark.parametrize("reliability", [False, True])
+@pytest.mark.parametrize(("mode", "walks"), [("weighted", 1), ("center", 1), ("robust", 4), ("solve", None)])
+def test_progress_of_every_mode_reaches_what_it_announced(stage, mode, walks, reliability):
+    """All walks over the views count; how many those of "solve" are nobody knows before the end."""
+    calls = []
+    settings = LiftSettings(passes=3, iterations=1, ridge=1.0, reliability=reliability)
+    views = stage.views[:3]
+    lift(stage.gaussians, views, stage.one_hot, mode, lift_settings=settings, progress=lambda *c: calls.append(c[:2]))
+    assert [done for done, _ in calls] == list(range(len(calls)))
+    assert calls[-1][0] == calls[-1][1]
+    if walks is not None:
+        assert {total for _, total in calls} == {3 * (walks + reliability)}
+
+
+def test_maps_are_kept_within_a_limit_and_the_others_made_again(scene, monkeypatch):
+    """Room for two of the dense maps and no third: ids are small and may fit where a dense map does not."""
+    gaussians, views, maps, _ = scene
+    asked = []
+
+    def spy(view: View) -> FeatureMap:
+        asked.append(view.stem)
+        return maps["0"]
+
+    monkeypatch.setattr(map_reader, "KEPT_BYTES", int(2.5 * maps["0"].dense.nbytes))
+    lift(gaussians, views, spy, "robust", lift_settings=LiftSettings(passes=2))
+    counts = sorted(asked.count(view.stem) for view in views)
+    assert counts == [1, 1, 3, 3, 3]
+
+
 def wrong_view(stage, view: View) -> FeatureMap:
     """View 0001 takes every panel for the next one."""
     labels = stage.labels(view)
@@ -248,6 +311,27 @@ def test_holes_get_what_their_neighbors_have(stage):
     assert (filled.effective_views[blind] == 0).all()
     same = filled.features[blind].argmax(dim=1) == lifted.features[blind].argmax(dim=1)
     assert same.float().mean() > 0.9
+
+
+@pytest.mark.parametrize("wanted", [1, 3, 8])
+def test_fewer_were_seen_than_neighbors_are_asked(wanted):
+    """All that were seen speak then; what is not finite is neither asked nor filled."""
+    random = np.random.default_rng(1)
+    means = random.normal(size=(7, 3)).astype(np.float32)
+    means[6] = np.nan
+    quats = torch.tensor([1.0, 0, 0, 0]).expand(7, 4)
+    gaussians = Gaussians(torch.tensor(means), quats, torch.ones(7, 3), torch.ones(7), torch.zeros(7, 1, 3))
+    weight = torch.tensor([2.0, 3.0, 4.0, 0.0, 0.0, 0.0, 0.0])
+    features = torch.tensor(random.normal(size=(7, 2)), dtype=torch.float32) * (weight > 0)[:, None]
+    found = fill_holes(gaussians, Semantics(features, weight, weight.sign(), "t", gaussians.fingerprint), wanted)
+    for row in (3, 4, 5):
+        distance = np.linalg.norm(means[:3] - means[row], axis=1)
+        near = np.argsort(distance)[:wanted]
+        shares = (1 / distance[near]) / (1 / distance[near]).sum()
+        np.testing.assert_allclose(found.features[row], shares @ features[near].numpy(), atol=1e-5)
+        assert found.weight[row] == pytest.approx(TRUST * weight[near].mean().item())
+    assert torch.equal(found.features[[0, 1, 2, 6]], features[[0, 1, 2, 6]])
+    assert torch.equal(found.weight[[0, 1, 2, 6]], weight[[0, 1, 2, 6]])
 
 
 def test_filling_is_counted_and_leaves_the_coverage(stage):

@@ -174,3 +174,11 @@ def test_bad_queries(random_semantics):
         class_votes(random_semantics, None, encoder)
     with pytest.raises(InputError, match="text encoder of space 'toy'"):
         class_votes(random_semantics, ["cup"])
+
+
+@pytest.mark.parametrize(
+    ("count", "share", "chosen"), [(9, 0.3, 3), (9, 0.25, 2), (8, 0.2, 2), (7, 0.5, 4), (3, 0.9, 3)]
+)
+def test_a_share_of_the_best_is_rounded_to_the_nearest_count(count, share, chosen):
+    scores = torch.arange(count).float().flip(0)
+    assert select(scores, top_share=share).tolist() == [k < chosen for k in range(count)]

@@ -44,6 +44,8 @@ class VLPartFiles:
         InputError: The folder is missing.
     """
 
+    needs_image = False
+
     def __init__(self, folder: str | os.PathLike[str], least_score: float = 0.0) -> None:
         self.folder = Path(folder)
         self.least_score = least_score

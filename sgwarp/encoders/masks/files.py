@@ -41,6 +41,7 @@ class FileMasks:
     """
 
     identity = "masks of files"
+    needs_image = False
 
     def __init__(self, folder: str | os.PathLike[str], views: Sequence[View] = ()) -> None:
         self.folder = Path(folder)

@@ -1,0 +1,103 @@
+"""How many: points that a fit starts from, views that are measured, seconds of a run that was interrupted."""
+
+from itertools import count
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+import torch
+
+from sgwarp.files.images import write_ids
+from sgwarp.io.points import load_points
+from sgwarp.reconstruction.fitting import initial, loop, trainer
+from sgwarp.reconstruction.fitting.belongings import depth_from_folder
+from sgwarp.reconstruction.fitting.settings import FitSettings
+from sgwarp.reconstruction.fitting.trainer import fit
+from sgwarp.runs.log import RunLog
+
+
+@pytest.mark.parametrize(
+    ("strategy", "cap", "most"),
+    [
+        ("mcmc", 1_000, 1_000),  # moves what is there
+        ("default", 1_000, 500),  # has to find room for what it adds
+        ("mcmc", 60_000, 50_000),
+        ("default", 60_000, 30_000),
+        ("default", 500_000, 50_000),
+    ],
+)
+def test_points_that_are_made_leave_a_strategy_its_room(monkeypatch, strategy, cap, most):
+    asked = []
+
+    def agree(photographs, wanted, random, progress):
+        asked.append(wanted)
+        return torch.zeros(600, 3), torch.zeros(600, 3)
+
+    monkeypatch.setattr(initial, "_points_where_photographs_agree", agree)
+    settings = FitSettings(strategy=strategy, cap=cap)
+    initial.random_points([], settings)
+    initial.completed(torch.zeros(7, 3), torch.zeros(7, 3), [], settings, lambda *call: None)
+    assert asked == [most, most - 7]
+
+
+@pytest.mark.parametrize(
+    ("points", "cap", "more"),
+    [
+        (499, 1_000, True),  # less than half of what there is room for
+        (500, 1_000, False),
+        (19_999, 100_000, True),  # few for any scene
+        (20_000, 100_000, False),
+        (20_000, 1_000_000, False),
+    ],
+)
+def test_few_points_are_added_to(monkeypatch, points, cap, more):
+    added = []
+    monkeypatch.setattr(trainer, "require_overlap", lambda *rest: None)
+    monkeypatch.setattr(trainer, "completed", lambda *rest: added.append(1) or rest[:2])
+    monkeypatch.setattr(trainer, "gaussians_from_points", lambda positions, *rest: len(positions))
+    frame = SimpleNamespace(points=lambda positions: positions)
+    given = np.zeros((points, 3)), np.zeros((points, 3), np.float32)
+    assert trainer._starting(given, [], [], frame, FitSettings(cap=cap), None, "cpu") == points
+    assert bool(added) == more
+
+
+@pytest.mark.parametrize("number", [1, 63, 64, 65, 127, 128, 129, 500])
+def test_at_most_64_fitted_views_are_measured_and_as_many_as_that_allows(monkeypatch, number):
+    measured = []
+
+    def psnr_of(run, photographs, cameras):
+        assert [camera.stem for camera in cameras] == photographs
+        measured.extend(photographs)
+        return [30.0] * len(photographs)
+
+    monkeypatch.setattr(loop.Loop, "_psnr_of", psnr_of)
+    run = loop.Loop(FitSettings(), list(range(number)), [], 1.0, torch.device("cpu"), RunLog())
+    monkeypatch.setattr(run, "cameras", lambda: [SimpleNamespace(stem=k) for k in range(number)])
+    assert run.measure_fitted() == 30.0
+    every = next(n for n in count(1) if len(range(0, number, n)) <= 64)
+    assert measured == list(range(0, number, every))
+
+
+def test_a_resumed_run_counts_the_seconds_before(boards, tmp_path):
+    path, settings = tmp_path / "run.checkpoint", FitSettings(steps=6, cap=1300, sh_degree=0, evaluate_every=3)
+    options = {"checkpoint": path, "keep_checkpoint": True}
+    points = load_points(boards.folder)
+    first = fit(boards.views[1:], points, boards.views[:1], settings, **options)
+    saved = torch.load(path, weights_only=True)
+    assert saved["seconds"] == first.curve[-1].seconds > 0
+    torch.save({**saved, "step": 5, "seconds": 1000.0}, path)
+    resumed = fit(boards.views[1:], points, boards.views[:1], settings, **options, resume=True)
+    assert 1000.0 < resumed.curve[-1].seconds < 1100.0
+    assert [point.step for point in resumed.curve] == [3, 6]
+
+
+def test_depth_of_floats_is_in_meters_and_of_whole_numbers_in_the_unit(boards, tmp_path):
+    """Of whichever file: PNG, integers in NPY, and NPY of any floating point type."""
+    views = boards.views[:5]
+    shape, stems = views[0].camera.size, [view.stem for view in views]
+    for stem, kind, value in zip(stems[:4], ("f4", "f8", "u2", "i8"), (2.5, 2.5, 2500, 2500), strict=True):
+        np.save(tmp_path / f"{stem}.npy", np.full(shape, value, kind))
+    write_ids(tmp_path / f"{stems[4]}.png", np.full(shape, 2500, np.uint16))
+    depth = depth_from_folder(tmp_path, views)
+    for view in views:
+        np.testing.assert_allclose(depth(view), 2.5, rtol=1e-6)
