@@ -26,6 +26,7 @@ from sgwarp.ops.planar.projection import (
     unpack_symmetric,
 )
 from sgwarp.ops.planar.splats import SplatJob, composite_splats
+from sgwarp.ops.planar.tables import ShadeTable
 from sgwarp.ops.splatting.settings import RasterSettings
 from sgwarp.runs.isolation import isolated
 from sgwarp.scene.checks import require_finite
@@ -34,6 +35,7 @@ NEAR = 0.2  # [m]
 ALPHA_MAX = 0.99
 MIN_AREA_RATIO = 2.5e-5  # of the antialiasing compensation
 MIN_EIGENVALUE_GAP = 0.1  # under the root of the larger eigenvalue [pixels^4]
+CENTER_TOLERANCE = 1e-5  # relative, between campos and viewmatrix: rounding in float32; a campos farther off counts
 FOCAL_TOLERANCE = 1e-3  # relative, between tanfov and projmatrix
 
 
@@ -154,9 +156,7 @@ class GaussianRasterizer(torch.nn.Module):
             assert colors_precomp is not None
             values = select_rows(colors_precomp, p.index)
         else:
-            directions = select_rows(means3D, p.index) - settings.campos.to(means3D)
-            colors, shown = harmonic_colors(directions, select_rows(shs, p.index), settings.sh_degree)
-            values = torch.where(shown[:, None], colors, torch.nan)  # which is left out
+            values = _shade(p, means3D, shs, settings)
         channels, wants_depth = values.shape[1], settings.antialiasing is not None
         if wants_depth:
             values = torch.cat([values, 1.0 / p.depths[:, None]], dim=1)
@@ -230,6 +230,21 @@ def dist2(points: Tensor) -> Tensor:
         InputError: Another shape, fewer than 4 points, or a point that is not finite.
     """
     return mean_squared_neighbor_distance(points)
+
+
+def _shade(p: ProjectedSplats, means3D: Tensor, shs: Tensor, settings: GaussianRasterizationSettings) -> Tensor:
+    """Colours of the rows of the table, NaN where they are not finite, which is left out."""
+    degree, campos = settings.sh_degree, settings.campos
+    if p.camera is not None and degree <= 3 and shs.dtype == torch.float32:
+        position = p.camera.position
+        off = (campos.detach().to(position) - position).abs().max()
+        if off <= CENTER_TOLERANCE * (1.0 + position.abs().max()):
+            center = campos.to(means3D.device, torch.float64)
+            colors: Tensor = ShadeTable.apply(means3D.contiguous(), shs.contiguous(), center, p.index, p.camera, degree)
+            return colors
+    directions = select_rows(means3D, p.index) - campos.to(means3D)
+    colors, shown = harmonic_colors(directions, select_rows(shs, p.index), degree)
+    return torch.where(shown[:, None], colors, torch.nan)
 
 
 def _check(

@@ -120,6 +120,28 @@ def test_gradients(raw, principal, scale, antialiasing, sh):
     assert (means2D.grad - proxy).abs().max() <= 1e-3 * proxy.abs().max()
 
 
+@pytest.mark.parametrize("shift", [0.0, 0.4])
+def test_colors_are_those_seen_from_campos(raw, shift):
+    """Also where it is not where the view matrix looks from; its gradient against autograd in float64."""
+    settings = settings_of(raw)
+    campos = (settings.campos + shift).requires_grad_()
+    image, _ = call(raw, settings._replace(campos=campos), shs=raw.sh)
+    exact = campos.detach().double().requires_grad_()
+    directions = torch.nn.functional.normalize(raw.shape[0].double() - exact, dim=1)
+    basis = reference.harmonics(directions, 2)
+    colors = (torch.einsum("nk,nkc->nc", basis, raw.sh[:, :9].double()) + 0.5).clamp(min=0)
+    expected, _ = call(raw, settings, colors_precomp=colors.detach().float())
+    torch.testing.assert_close(image, expected, rtol=0, atol=2e-5)
+    weights = torch.rand(3, HEIGHT, WIDTH, generator=torch.Generator().manual_seed(4))
+    (image * weights).sum().backward()
+    leaf = colors.detach().float().requires_grad_()
+    again, _ = call(raw, settings, colors_precomp=leaf)
+    (again * weights).sum().backward()
+    colors.backward(leaf.grad.double())
+    assert exact.grad.abs().max() > 0
+    assert (campos.grad - exact.grad).abs().max() <= 1e-3 * exact.grad.abs().max()
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize("antialiasing", [False, True])
 @pytest.mark.parametrize("given", ["shs", "colors_precomp", "cov3D_precomp"])

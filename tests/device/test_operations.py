@@ -297,6 +297,15 @@ def test_the_rasterizer_of_inria(make_scene, pretended_cuda):
     assert (gradient_there.cpu() - gradient).norm() < 5e-3 * gradient.norm()
 
 
+def test_the_facade_of_inria_projects_and_shades_by_kernels(sh3, pretended_cuda):
+    settings = inria_settings(sh3.camera, "cuda")
+    there = sh3.gaussians.to("cuda")
+    pretended_cuda.reset()
+    inria_image(there, settings)
+    assert {"tabulate_splats", "evaluate_harmonics", "harmonics_backward"} <= set(pretended_cuda.launches)
+    assert pretended_cuda.work < 220  # 403 with harmonics in torch
+
+
 def test_a_stream_of_its_own(sh3, pretended_cuda):
     """Every launch, and the sort, goes to the stream that is torch's current one."""
     there = leaves(sh3.gaussians.to("cuda"), sh3.gaussians.sh.to("cuda"))
