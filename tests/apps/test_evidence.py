@@ -20,8 +20,10 @@ from sgwarp.apps.instances.association import (
 from sgwarp.apps.instances.description import GroupFacts, _parents, find_doubts, oriented_box, quaternion
 from sgwarp.apps.instances.evidence import ViewEvidence, view_evidence
 from sgwarp.apps.instances.finder import mean_features
+from sgwarp.apps.instances.naming import name_instances
 from sgwarp.apps.instances.settings import InstanceSettings
 from sgwarp.apps.instances.view_agreement import agreement
+from sgwarp.encoders.calibration import Calibration
 from sgwarp.encoders.masks.sources import ViewMasks
 from sgwarp.errors import InputError
 from sgwarp.ops.reference import lifting as reference
@@ -330,3 +332,25 @@ def test_doubts_look_at_the_features_of_their_own_level():
     alike, apart = torch.tensor([[1.0, 0.0], [1.0, 0.1]]), torch.eye(2)
     for features, may_be in (((alike, apart), [(2,), (1,), (), ()]), ((apart, alike), [(), (), (4,), (3,)])):
         assert [row.may_be for row in find_doubts(table, facts, torch.cat(features))] == may_be
+
+
+@pytest.mark.parametrize("scoring", ["cosine", "relevancy", "evidence"])
+def test_an_instance_that_no_view_showed_has_no_name(scoring):
+    """It has no feature: its cosine with every class is the same, and says nothing."""
+    zero = (0.0, 0.0, 0.0)
+    table = tuple(
+        Instance(k, "default", 0, 9, 1, 1, 1.0, zero, (1.0, 0.0, 0.0, 0.0), zero, label="kept") for k in (1, 2, 3)
+    )
+    ids = torch.ones(1, 4, 1, dtype=torch.int32)
+    features = torch.tensor([[1.0, 0.0, 0.0], [0.0, 0.0, 0.0], [0.0, 1.0, 0.0]])
+    found = InstanceMap(ids, torch.ones(1, 4, 1), torch.ones(4), table, ("default",), "x", 0.5, features, "toy")
+
+    class Axes:
+        space, calibration = "toy", Calibration(scoring, 0.1, level=0.1)
+
+        def encode_text(self, texts):
+            return torch.stack([torch.eye(3)[{"a": 0, "b": 1}.get(text, 2)] for text in texts])
+
+    named = name_instances(found, ["a", "b"], Axes()).table
+    assert [row.label for row in named] == ["a", "kept", "b"]
+    assert [row.label_score > 0.5 for row in named] == [True, False, True]

@@ -57,6 +57,25 @@ def test_what_is_done_is_skipped_and_what_changed_is_done_again(batch):
     assert batch.results()["scene04/first.bin"] == hashlib.sha512(b"first scene 99").digest() * 2000
 
 
+@pytest.mark.parametrize(
+    ("stages", "again"),
+    [
+        (("first", "second", "third"), ("third",)),
+        (("zeroth", "first", "second"), ("zeroth", "first", "second")),  # what comes first may change what follows
+        (("second", "first"), ("second", "first")),
+        (("first", "third"), ("first", "third")),
+    ],
+)
+def test_stages_are_kept_as_far_as_their_order_is_the_same(batch, stages, again):
+    list(LocalEngine(2)(batch.tasks()))
+    before = len(batch.starts())
+    other = type(batch)(batch.folder, stages=stages)
+    assert set(batch.statuses(LocalEngine(2)(other.tasks(run="run 2"))).values()) == {"done"}
+    assert sorted(batch.starts()[before:]) == sorted(f"{name} {stage}" for name in NAMES for stage in again)
+    assert {name for name in batch.results() if name.split("/")[1][:-4] in stages} == set(expected(NAMES, stages))
+    assert list(batch.record("scene03")["seconds"]) == list(stages)
+
+
 def test_added_stages_leave_what_is_done(batch):
     list(LocalEngine(1)(batch.tasks()))
     before = (batch.folder / "out" / "scene00" / "first.bin").stat().st_mtime_ns

@@ -2,6 +2,9 @@ import pytest
 import torch
 
 from sgwarp.encoders.base import TextEncoder
+from sgwarp.encoders.building import Request
+from sgwarp.encoders.catalogue import KINDS
+from sgwarp.encoders.names import Part
 from sgwarp.encoders.prompts import BATCH, PHOTO, PLAIN, ROOM, Phrases, fill_templates, named_templates
 from sgwarp.errors import InputError
 
@@ -67,3 +70,18 @@ def test_named_templates():
     assert named_templates(["room"]) == ROOM
     with pytest.raises(InputError, match="prompt template 'rooms'"):
         named_templates(["rooms"])
+
+
+@pytest.mark.parametrize(
+    ("asked", "named", "expected"),
+    [
+        (None, None, {}),  # the encoder's own
+        (None, ("room",), {"templates": ROOM}),
+        (("plain",), None, {"templates": PLAIN}),
+        (("plain",), ("room",), {"templates": PLAIN}),  # what is asked for goes before what the name says
+        (("the {}", "photo"), ("room",), {"templates": ("the {}", *PHOTO)}),
+    ],
+)
+def test_whose_templates_are_taken(asked, named, expected):
+    part = Part("conse", KINDS["conse"], "", {} if named is None else {"templates": named})
+    assert Request("conse", templates=asked).templates_of(part) == expected

@@ -11,6 +11,8 @@ from sgwarp.files.images import write_ids
 from sgwarp.io.points import load_points
 from sgwarp.reconstruction.fitting import initial, loop, trainer
 from sgwarp.reconstruction.fitting.belongings import depth_from_folder
+from sgwarp.reconstruction.fitting.exposure import Exposure
+from sgwarp.reconstruction.fitting.per_photograph import PerPhotograph
 from sgwarp.reconstruction.fitting.settings import FitSettings
 from sgwarp.reconstruction.fitting.trainer import fit
 from sgwarp.runs.log import RunLog
@@ -101,3 +103,27 @@ def test_depth_of_floats_is_in_meters_and_of_whole_numbers_in_the_unit(boards, t
     depth = depth_from_folder(tmp_path, views)
     for view in views:
         np.testing.assert_allclose(depth(view), 2.5, rtol=1e-6)
+
+
+def test_every_photograph_has_steps_of_its_own():
+    """The first step of Adam is the rate, however many steps the parameters of others have taken."""
+    rows = PerPhotograph(torch.zeros(3, 2), rate=0.1, last_rate=0.1)
+    for _ in range(7):
+        rows.update(0, torch.ones(2), 0.0)
+    rows.update(2, torch.tensor([5.0, -0.01]), 0.0)
+    torch.testing.assert_close(rows.group.parameters[2], torch.tensor([-0.1, 0.1]), rtol=1e-3, atol=0)
+    torch.testing.assert_close(rows.group.parameters[0], torch.full((2,), -0.7), rtol=1e-3, atol=0)
+    assert not rows.group.parameters[1].any()
+    assert rows.steps.tolist() == [7, 0, 1]
+
+
+def test_what_all_photographs_share_belongs_to_the_scene():
+    """A factor of all exposures and a motion of all cameras leave no trace; what one has beyond them stays."""
+    exposure = Exposure(3, torch.device("cpu"))
+    exposure.group.parameters += 0.25
+    for index in range(3):
+        torch.testing.assert_close(exposure.leaf(index).detach(), torch.eye(3, 4))
+    exposure.group.parameters[1] += 0.3
+    sums = sum(exposure.leaf(index).detach() for index in range(3))
+    torch.testing.assert_close(sums, 3 * torch.eye(3, 4))
+    torch.testing.assert_close(exposure.leaf(1).detach(), torch.eye(3, 4) + 0.2)
