@@ -51,7 +51,7 @@ class Subject:
 
 
 def subjects() -> list[Subject]:
-    """The kernels of a rendering, a training step and a lift."""
+    """The kernels of a rendering, a training step, a lift, and the network on voxels."""
     from sgwarp.kernels.compositing import block, block_backward
     from sgwarp.kernels.contributors import block as contributors
     from sgwarp.kernels.fitting import adam, adam_elements, photometric_block
@@ -59,6 +59,7 @@ def subjects() -> list[Subject]:
     from sgwarp.kernels.harmonics import forward as harmonics
     from sgwarp.kernels.lifting import block as lifting
     from sgwarp.kernels.projection import backward, forward
+    from sgwarp.kernels.sparse import convolution_block, normalization_block, voxels
 
     def replay(*flags: bool) -> Callable[[], Any]:
         return lambda: block_backward.make_composite_backward_block(*flags)
@@ -88,6 +89,13 @@ def subjects() -> list[Subject]:
         Subject("backward, harmonics", lambda: harmonics_backward.harmonics_backward),
         Subject("count steps", lambda: adam.count_steps),
         Subject("Adam", lambda: adam_elements.update_elements, items="parameter"),
+        Subject("kernel map", lambda: voxels.tabulate_neighbors, items="offset and voxel"),
+        Subject("convolution, statistics", lambda: convolution_block.convolve_blocks, items="16 sums"),
+        Subject("layer in inference", lambda: convolution_block.convolve_and_finish_blocks, items="16 sums"),
+        Subject("backward, convolution", lambda: convolution_block.convolve_backward_blocks, items="16 or 4 sums"),
+        Subject("normalize", lambda: normalization_block.normalize_elements, items="element"),
+        Subject("backward, sums", lambda: normalization_block.sum_normalized_blocks, items="share of a channel"),
+        Subject("backward, normalize", lambda: normalization_block.normalize_backward_elements, items="element"),
     ]
 
 

@@ -428,8 +428,9 @@ def _pretend_torch(patch: pytest.MonkeyPatch, device: PretendedDevice) -> None:
     patch.setattr(_WorkItem, "run", run)
     autocast = torch.autocast
     patch.setattr(torch, "autocast", lambda kind, *args, **kwargs: autocast("cpu", *args, **kwargs))
-    for name in ("is_autocast_enabled", "get_autocast_dtype"):
-        patch.setattr(torch, name, lambda kind="cpu", ask=getattr(torch, name): ask("cpu"))
+    enabled, dtype = torch.is_autocast_enabled, torch.get_autocast_dtype
+    patch.setattr(torch, "is_autocast_enabled", lambda *kind: enabled("cpu"))
+    patch.setattr(torch, "get_autocast_dtype", lambda kind: dtype("cpu"))
 
 
 def _pretend_gradients(patch: pytest.MonkeyPatch, device: PretendedDevice) -> None:

@@ -28,6 +28,7 @@ STRIDE = TARGETS + 1  # floats between two channels of the staged rows
 WIDTH = CHANNELS + 1  # floats between two channels of the staged weights
 LANES = BLOCK // CHANNELS  # threads that share a channel
 PAIRS = 32  # staged at a time
+BLOCKS = 3  # that a multiprocessor should hold: no more than 80 registers
 GROUP = 16  # entries of a table whose pairs are counted by one thread
 Products = wp.types.vector(length=OWN * OWN, dtype=wp.float32)
 Quarter = wp.types.vector(length=4, dtype=wp.float32)
@@ -47,6 +48,7 @@ def sum_products(
     outputs: int,  # channels of the result
     t: int,
     used: wp.tile[float],
+    read: wp.tile[int],
     rows: wp.tile[float],
     weights: wp.tile[float],
 ) -> Products:
@@ -64,23 +66,27 @@ def sum_products(
     products = Products(0.0)
     for k in range(offsets):
         if wp.tile_extract(used, k) != 0.0:
-            place = wp.where(mirrored != 0, offsets - 1 - k, k)
+            if t < TARGETS:
+                source = int(-1)
+                if t < count:
+                    source = first + t
+                    if k != identity:
+                        source = table[wp.where(mirrored != 0, offsets - 1 - k, k), first + t]
+                put_int(read, t, source)
+            barrier()
             for c0 in range(0, inputs, CHANNELS):
-                for e in range(t, wp.static(TARGETS * CHANNELS), BLOCK):
-                    r = e / CHANNELS
-                    c = e % CHANNELS
+                c = t % CHANNELS
+                for r in range(t / CHANNELS, TARGETS, LANES):
+                    source = wp.tile_extract(read, r)
                     value = float(0.0)
-                    if r < count and c0 + c < inputs:
-                        source = first + r
-                        if k != identity:
-                            source = table[place, first + r]
-                        if source >= 0:
-                            value = features[source, c0 + c]
+                    if source >= 0 and c0 + c < inputs:
+                        value = features[source, c0 + c]
                     put(rows, STRIDE * c + r, value)
-                for e in range(t, wp.static(CHANNELS * CHANNELS), BLOCK):
+                near = t % CHANNELS
+                for far in range(t / CHANNELS, CHANNELS, LANES):
                     # Neighbouring threads read neighbouring weights.
-                    c = wp.where(turned != 0, e % CHANNELS, e / CHANNELS)
-                    o = wp.where(turned != 0, e / CHANNELS, e % CHANNELS)
+                    c = wp.where(turned != 0, near, far)
+                    o = wp.where(turned != 0, far, near)
                     value = float(0.0)
                     if c0 + c < inputs and first_output + o < outputs:
                         if turned != 0:
@@ -100,8 +106,16 @@ def sum_products(
 
 
 @wp.func
+def share_products(products: Products, t: int, rows: wp.tile[float]):
+    """To shared memory, channel by channel; the threads of a warp then write neighbouring channels of a row."""
+    for i in range(OWN):
+        for j in range(OWN):
+            put(rows, STRIDE * (t % 8 + 8 * j) + t / 8 + 32 * i, products[OWN * i + j])
+    barrier()
+
+
+@wp.func
 def leave_moments(
-    products: Products,
     count: int,
     first_output: int,
     outputs: int,
@@ -113,10 +127,6 @@ def leave_moments(
 ):
     """Mean and squared deviations from it of a block's rows, of every channel; counted from the first row, so that a
     large mean does not drown them."""
-    for i in range(OWN):
-        for j in range(OWN):
-            put(rows, STRIDE * (t % 8 + 8 * j) + t / 8 + 32 * i, products[OWN * i + j])
-    barrier()
     c = t / LANES
     lane = t % LANES
     origin = wp.tile_extract(rows, STRIDE * c)
@@ -197,7 +207,7 @@ def join_moments(
         variance_out[o] = (1.0 - momentum) * variance_out[o] + momentum * unbiased
 
 
-@wp.kernel
+@wp.kernel(launch_bounds=(BLOCK, BLOCKS))
 def convolve_blocks(
     # In:
     features: wp.array2d[float],  # [N, C_in]
@@ -223,22 +233,36 @@ def convolve_blocks(
     first_output = group * CHANNELS
     count = wp.min(TARGETS, rows_out - first)
     used = wp.tile_zeros(shape=(MAX_OFFSETS,), dtype=float, storage="shared")
+    read = wp.tile_empty(shape=(TARGETS,), dtype=int, storage="shared")
     rows = wp.tile_empty(shape=(wp.static(CHANNELS * STRIDE),), dtype=float, storage="shared")
     weights = wp.tile_empty(shape=(wp.static(CHANNELS * WIDTH),), dtype=float, storage="shared")
     sums = wp.tile_empty(shape=(wp.static(2 * BLOCK),), dtype=wp.float64, storage="shared")
     flag = wp.tile_empty(shape=(1,), dtype=int, storage="shared")
     barrier()
     products = sum_products(
-        features, weight, 0, table, mirrored, identity, first, first_output, count, outputs, t, used, rows, weights
+        features,
+        weight,
+        0,
+        table,
+        mirrored,
+        identity,
+        first,
+        first_output,
+        count,
+        outputs,
+        t,
+        used,
+        read,
+        rows,
+        weights,
     )
-    for i in range(OWN):
-        for j in range(OWN):
-            r = t / 8 + 32 * i
-            o = first_output + t % 8 + 8 * j
-            if r < count and o < outputs:
-                features_out[first + r, o] = products[OWN * i + j]
+    share_products(products, t, rows)
+    o = first_output + t % CHANNELS
+    if o < outputs:
+        for r in range(t / CHANNELS, count, LANES):
+            features_out[first + r, o] = wp.tile_extract(rows, STRIDE * (t % CHANNELS) + r)
     if statistics_out.shape[0] > 0:
-        leave_moments(products, count, first_output, outputs, part, t, rows, weights, moments)
+        leave_moments(count, first_output, outputs, part, t, rows, weights, moments)
         if comes_last(arrived, group, (rows_out + TARGETS - 1) / TARGETS, t, flag):
             join_moments(
                 moments,
@@ -255,7 +279,7 @@ def convolve_blocks(
             )
 
 
-@wp.kernel
+@wp.kernel(launch_bounds=(BLOCK, BLOCKS))
 def convolve_and_finish_blocks(
     # In:
     features: wp.array2d[float],  # [N, C_in]
@@ -282,6 +306,7 @@ def convolve_and_finish_blocks(
     first_output = group * CHANNELS
     count = wp.min(TARGETS, features_out.shape[0] - first)
     used = wp.tile_zeros(shape=(MAX_OFFSETS,), dtype=float, storage="shared")
+    read = wp.tile_empty(shape=(TARGETS,), dtype=int, storage="shared")
     rows = wp.tile_empty(shape=(wp.static(CHANNELS * STRIDE),), dtype=float, storage="shared")
     weights = wp.tile_empty(shape=(wp.static(CHANNELS * WIDTH),), dtype=float, storage="shared")
     barrier()
@@ -293,20 +318,32 @@ def convolve_and_finish_blocks(
                 features_out[first + r, outputs + c] = beside[first + r, c]
     else:
         products = sum_products(
-            features, weight, 0, table, mirrored, identity, first, first_output, count, outputs, t, used, rows, weights
+            features,
+            weight,
+            0,
+            table,
+            mirrored,
+            identity,
+            first,
+            first_output,
+            count,
+            outputs,
+            t,
+            used,
+            read,
+            rows,
+            weights,
         )
-        for j in range(OWN):
-            o = first_output + t % 8 + 8 * j
-            if o < outputs:
-                scale = gain[o] / wp.sqrt(variance[o] + epsilon)
-                for i in range(OWN):
-                    r = t / 8 + 32 * i
-                    if r < count:
-                        value = (products[OWN * i + j] - mean[o]) * scale + bias[o]
-                        if shortcut.shape[0] > 0:
-                            value += shortcut[first + r, o]
-                        # The comparison keeps NaN, as torch's does.
-                        features_out[first + r, o] = wp.where(value < least, least, value)
+        share_products(products, t, rows)
+        o = first_output + t % CHANNELS
+        if o < outputs:
+            scale = gain[o] / wp.sqrt(variance[o] + epsilon)
+            for r in range(t / CHANNELS, count, LANES):
+                value = (wp.tile_extract(rows, STRIDE * (t % CHANNELS) + r) - mean[o]) * scale + bias[o]
+                if shortcut.shape[0] > 0:
+                    value += shortcut[first + r, o]
+                # The comparison keeps NaN, as torch's does.
+                features_out[first + r, o] = wp.where(value < least, least, value)
 
 
 @wp.func
@@ -406,7 +443,7 @@ def sum_weights(
     return sums
 
 
-@wp.kernel
+@wp.kernel(launch_bounds=(BLOCK, BLOCKS))
 def convolve_backward_blocks(
     # In:
     features: wp.array2d[float],  # [N, C_in]
@@ -429,6 +466,7 @@ def convolve_backward_blocks(
     """Both gradients; one block per 128 sources and 32 C_in, and one per share, offset and 32 x 32 weights."""
     block, t = wp.tid()
     used = wp.tile_zeros(shape=(MAX_OFFSETS,), dtype=float, storage="shared")
+    read = wp.tile_empty(shape=(TARGETS,), dtype=int, storage="shared")
     rows = wp.tile_empty(shape=(wp.static(CHANNELS * STRIDE),), dtype=float, storage="shared")
     weights = wp.tile_empty(shape=(wp.static(CHANNELS * WIDTH),), dtype=float, storage="shared")
     marks = wp.tile_empty(shape=(BLOCK,), dtype=int, storage="shared")
@@ -444,17 +482,30 @@ def convolve_backward_blocks(
         first_output = (block % across) * CHANNELS
         count = wp.min(TARGETS, features_out.shape[0] - first)
         products = sum_products(
-            gradient, weight, 1, table, mirrored, identity, first, first_output, count, channels, t, used, rows, weights
+            gradient,
+            weight,
+            1,
+            table,
+            mirrored,
+            identity,
+            first,
+            first_output,
+            count,
+            channels,
+            t,
+            used,
+            read,
+            rows,
+            weights,
         )
-        for i in range(OWN):
-            for j in range(OWN):
-                r = t / 8 + 32 * i
-                o = first_output + t % 8 + 8 * j
-                if r < count and o < channels:
-                    value = products[OWN * i + j]
-                    if addend.shape[0] > 0:
-                        value += addend[first + r, o]
-                    features_out[first + r, o] = value
+        share_products(products, t, rows)
+        o = first_output + t % CHANNELS
+        if o < channels:
+            for r in range(t / CHANNELS, count, LANES):
+                value = wp.tile_extract(rows, STRIDE * (t % CHANNELS) + r)
+                if addend.shape[0] > 0:
+                    value += addend[first + r, o]
+                features_out[first + r, o] = value
     else:
         place = block - feature_blocks
         across = (weight_out.shape[2] + CHANNELS - 1) / CHANNELS
