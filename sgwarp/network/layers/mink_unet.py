@@ -48,7 +48,8 @@ class BasicBlock(nn.Module):
         y, x = normalized(self.conv1, self.norm1, x)
         shortcut = x
         if self.downsample is not None:
-            shortcut, _ = normalized(*self.downsample, x, rectify=False)
+            layers: Any = self.downsample
+            shortcut, _ = normalized(layers[0], layers[1], x, rectify=False)
         return normalized(self.conv2, self.norm2, y, shortcut=shortcut)[0]
 
 
@@ -115,8 +116,9 @@ class MinkUNet(nn.Module):
     def _normalized(
         self, conv: str, norm: str, x: SparseTensor, beside: SparseTensor | None = None
     ) -> tuple[SparseTensor, SparseTensor]:
-        layers: Any = self.get_submodule(conv), self.get_submodule(norm)
-        return normalized(*layers, x, beside=beside)
+        layer: Any = self.get_submodule(conv)
+        following: Any = self.get_submodule(norm)
+        return normalized(layer, following, x, beside=beside)
 
     def forward(self, x: SparseTensor) -> SparseTensor:
         """Embedding of every voxel, [N, out_channels]; not normalised."""

@@ -150,12 +150,14 @@ class KernelMap:
     @property
     def sources(self) -> Tensor:
         """Row that is read, int64 [pairs]."""
-        return self._pairs[1 if self.turned else 0]
+        found, written, _ = self._pairs
+        return written if self.turned else found
 
     @property
     def targets(self) -> Tensor:
         """Row that is written, int64 [pairs]; no row twice within an offset."""
-        return self._pairs[0 if self.turned else 1]
+        found, written, _ = self._pairs
+        return found if self.turned else written
 
     @property
     def starts(self) -> tuple[int, ...]:
