@@ -26,12 +26,15 @@ from sgwarp.ops.planar.projection import (
     unpack_symmetric,
 )
 from sgwarp.ops.planar.splats import SplatJob, composite_splats
+from sgwarp.ops.planar.tables import ShadeTable
 from sgwarp.ops.splatting.settings import RasterSettings
 from sgwarp.runs.isolation import isolated
+from sgwarp.scene import Camera
 from sgwarp.scene.checks import require_finite
 
 NEAR = 0.2  # [m]
 ALPHA_MAX = 0.99
+MAX_DEGREE = 3  # of the harmonics that kernels evaluate
 MIN_AREA_RATIO = 2.5e-5  # of the antialiasing compensation
 MIN_EIGENVALUE_GAP = 0.1  # under the root of the larger eigenvalue [pixels^4]
 FOCAL_TOLERANCE = 1e-3  # relative, between tanfov and projmatrix
@@ -153,6 +156,8 @@ class GaussianRasterizer(torch.nn.Module):
         if shs is None:
             assert colors_precomp is not None
             values = select_rows(colors_precomp, p.index)
+        elif p.camera is not None and settings.sh_degree <= MAX_DEGREE and shs.dtype == torch.float32:
+            values = _shade(means3D, shs, p.index, p.camera, viewmat, settings)
         else:
             directions = select_rows(means3D, p.index) - settings.campos.to(means3D)
             colors, shown = harmonic_colors(directions, select_rows(shs, p.index), settings.sh_degree)
@@ -165,6 +170,26 @@ class GaussianRasterizer(torch.nn.Module):
         image = layers[..., :channels] + transmittance[..., None] * settings.bg.to(layers)
         found = image.permute(2, 0, 1).contiguous(), _radii(p, len(means3D))
         return (*found, layers[..., channels:].permute(2, 0, 1).contiguous()) if wants_depth else found
+
+
+def _shade(
+    means: Tensor,
+    shs: Tensor,
+    index: Tensor,
+    camera: Camera,
+    viewmat: Tensor,
+    settings: GaussianRasterizationSettings,
+) -> Tensor:
+    """Colors of the visible Gaussians by kernels (CUDA), NaN where they are not finite, [V, 3].
+
+    The kernels look from the camera's own centre, Inria's rasterizer from `campos`: the difference moves the Gaussians.
+    """
+    with torch.no_grad():
+        pose = viewmat.to(means.device, torch.float64)
+        center = -(pose[:3, :3].T @ pose[:3, 3])
+    moved = means + (center - settings.campos.to(means.device, torch.float64)).to(means.dtype)
+    values: Tensor = ShadeTable.apply(moved, shs.contiguous(), center, index, camera, settings.sh_degree)
+    return values
 
 
 class SparseGaussianAdam(torch.optim.Adam):
