@@ -428,13 +428,9 @@ def _pretend_torch(patch: pytest.MonkeyPatch, device: PretendedDevice) -> None:
     patch.setattr(_WorkItem, "run", run)
     autocast = torch.autocast
     patch.setattr(torch, "autocast", lambda kind, *args, **kwargs: autocast("cpu", *args, **kwargs))
-    for name in ("is_autocast_enabled", "get_autocast_dtype"):
-        patch.setattr(torch, name, _of_the_cpu(getattr(torch, name)))
-
-
-def _of_the_cpu(ask: Callable[[str], Any]) -> Callable[..., Any]:
-    """The same question, asked of the CPU whatever device is named."""
-    return lambda kind="cpu": ask("cpu")
+    enabled, dtype = torch.is_autocast_enabled, torch.get_autocast_dtype
+    patch.setattr(torch, "is_autocast_enabled", lambda *kind: enabled("cpu"))
+    patch.setattr(torch, "get_autocast_dtype", lambda kind: dtype("cpu"))
 
 
 def _pretend_gradients(patch: pytest.MonkeyPatch, device: PretendedDevice) -> None:

@@ -32,8 +32,9 @@ unpack() {  # WHEEL FOLDER
     mkdir -p "$2"
     for wheel in "$work/wheels/$1"-*.whl; do python3 -m zipfile -e "$wheel" "$2"; done
 }
-pack() {  # FOLDER ARCHIVE PRESET
-    tar c -C "$1" . | xz --x86 "--lzma2=preset=$3" > "$2"
+pack() {  # FOLDER ARCHIVE
+    tar c -C "$1" . | xz -T0 --x86 --lzma2=preset=6 > "$2.part"  # with 9e Warp alone takes too long to wait for
+    mv "$2.part" "$2"
 }
 
 unpack warp_lang "$work/warp"
@@ -41,16 +42,16 @@ python3 "$root/tools/keep_one_architecture.py" "$work/warp/warp/bin/warp.so" "$a
 mkdir -p "$work/clang/warp/bin"
 mv "$work/warp/warp/bin/warp-clang.so" "$work/clang/warp/bin/"
 rm -rf "$work/warp/warp/tests" "$work/warp/warp/examples"
-pack "$work/warp" "$out/warp.tar.xz" 9e
-pack "$work/clang" "$out/clang.tar.xz" 6
+pack "$work/warp" "$out/warp.tar.xz"
+pack "$work/clang" "$out/clang.tar.xz"
 
 for name in plyfile tyro docstring_parser typeguard typing_extensions; do unpack "$name" "$work/libraries"; done
-pack "$work/libraries" "$out/libraries.tar.xz" 6
+pack "$work/libraries" "$out/libraries.tar.xz"
 
 unpack gsplat "$work/gsplat"
-pack "$work/gsplat" "$out/gsplat.tar.xz" 6
+pack "$work/gsplat" "$out/gsplat.tar.xz"
 
 mkdir -p "$work/here"
 git -C "$root" archive --prefix=project/ HEAD ':!docs/images' | tar x -C "$work/here"
-pack "$work/here" "$out/project.tar.xz" 6
+pack "$work/here" "$out/project.tar.xz"
 ls -l "$out"

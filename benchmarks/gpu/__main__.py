@@ -25,6 +25,7 @@ PARTS = {
     "ceilings": timings.ceilings,
     "extremes": checks.extremes,
     "operations": checks.operations,
+    "layers": checks.layers,
     "streams": checks.streams,
     "determinism": checks.determinism,
     "demo": checks.demo,

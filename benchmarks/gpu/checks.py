@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from copy import deepcopy
 from dataclasses import replace
 from typing import Any
 
@@ -14,6 +15,9 @@ from sgwarp.demo.data import Room
 from sgwarp.demo.measurement import measure
 from sgwarp.evaluation.report.extremes import EXTREMES
 from sgwarp.evaluation.report.stability import check, check_gradients
+from sgwarp.network.layers.mink_unet import MinkUNet
+from sgwarp.network.layers.sparse import Grid, SparseTensor
+from sgwarp.ops.sparse.voxels import pack_voxels
 from sgwarp.ops.splatting.lifting import LiftSums, lift_view
 
 
@@ -91,6 +95,39 @@ def step(bench: Bench, camera: sg.Camera, **options: Any) -> list[torch.Tensor]:
     sums = LiftSums.zeros(len(gaussians), 16, bench.device)
     lift_view(gaussians, camera, feature_map, sums, deterministic=options.get("deterministic"))
     return [rendering.features.detach(), *(leaf.grad for leaf in leaves), sums.features]
+
+
+def layers(bench: Bench) -> dict[str, Any]:
+    """A training step of the network on voxels and its inference, on the device twice and on the CPU.
+
+    On the device both times have the same bits; the blocks that count each other would show it if they did not.
+    """
+    dice = torch.Generator().manual_seed(0)
+    torch.manual_seed(0)
+    net = MinkUNet(3, 16, "14A")
+    count = 300 if bench.tiny else 30_000
+    places = torch.randint(0, round(2 * count ** (1 / 3)), (count, 3), generator=dice)
+    keys = pack_voxels(torch.cat([torch.zeros(count, 1, dtype=torch.int64), places], dim=1)).unique()
+    values, results = torch.rand(len(keys), 3, generator=dice), []
+    for device in (bench.device, bench.device, torch.device("cpu")):
+        copy = deepcopy(net).to(device)
+        voxels = SparseTensor(values.to(device), Grid({1: keys.to(device)}))
+        y = copy(voxels).features
+        y.square().mean().backward()
+        with torch.inference_mode():
+            inferred = copy.eval()(voxels).features
+        named = {"trained on": y, "inferred": inferred} | dict(copy.named_buffers())
+        named |= {f"gradient of {name}": p.grad for name, p in copy.named_parameters()}
+        results.append({name: tensor.detach().cpu().double() for name, tensor in named.items()})
+    first, second, exact = results
+    found = {"same bits twice": all(torch.equal(first[name], second[name]) for name in first)}
+    for name in ("trained on", "inferred"):
+        found[name] = difference(first[name], exact[name])
+    for kind in ("running", "gradient"):
+        errors = {n: float((first[n] - e).norm() / e.norm().clamp(min=1e-30)) for n, e in exact.items() if kind in n}
+        found[f"{kind}, worst by norm"] = dict([max(errors.items(), key=lambda pair: pair[1])])
+    print(f"  {found}", flush=True)
+    return found
 
 
 def streams(bench: Bench) -> dict[str, Any]:

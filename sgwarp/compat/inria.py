@@ -29,13 +29,14 @@ from sgwarp.ops.planar.splats import SplatJob, composite_splats
 from sgwarp.ops.planar.tables import ShadeTable
 from sgwarp.ops.splatting.settings import RasterSettings
 from sgwarp.runs.isolation import isolated
+from sgwarp.scene import Camera
 from sgwarp.scene.checks import require_finite
 
 NEAR = 0.2  # [m]
 ALPHA_MAX = 0.99
+MAX_DEGREE = 3  # of the harmonics that kernels evaluate
 MIN_AREA_RATIO = 2.5e-5  # of the antialiasing compensation
 MIN_EIGENVALUE_GAP = 0.1  # under the root of the larger eigenvalue [pixels^4]
-CENTER_TOLERANCE = 1e-5  # relative, between campos and viewmatrix: rounding in float32; a campos farther off counts
 FOCAL_TOLERANCE = 1e-3  # relative, between tanfov and projmatrix
 
 
@@ -155,8 +156,12 @@ class GaussianRasterizer(torch.nn.Module):
         if shs is None:
             assert colors_precomp is not None
             values = select_rows(colors_precomp, p.index)
+        elif p.camera is not None and settings.sh_degree <= MAX_DEGREE and shs.dtype == torch.float32:
+            values = _shade(means3D, shs, p.index, p.camera, viewmat, settings)
         else:
-            values = _shade(p, means3D, shs, settings)
+            directions = select_rows(means3D, p.index) - settings.campos.to(means3D)
+            colors, shown = harmonic_colors(directions, select_rows(shs, p.index), settings.sh_degree)
+            values = torch.where(shown[:, None], colors, torch.nan)  # which is left out
         channels, wants_depth = values.shape[1], settings.antialiasing is not None
         if wants_depth:
             values = torch.cat([values, 1.0 / p.depths[:, None]], dim=1)
@@ -165,6 +170,26 @@ class GaussianRasterizer(torch.nn.Module):
         image = layers[..., :channels] + transmittance[..., None] * settings.bg.to(layers)
         found = image.permute(2, 0, 1).contiguous(), _radii(p, len(means3D))
         return (*found, layers[..., channels:].permute(2, 0, 1).contiguous()) if wants_depth else found
+
+
+def _shade(
+    means: Tensor,
+    shs: Tensor,
+    index: Tensor,
+    camera: Camera,
+    viewmat: Tensor,
+    settings: GaussianRasterizationSettings,
+) -> Tensor:
+    """Colors of the visible Gaussians by kernels (CUDA), NaN where they are not finite, [V, 3].
+
+    The kernels look from the camera's own centre, Inria's rasterizer from `campos`: the difference moves the Gaussians.
+    """
+    with torch.no_grad():
+        pose = viewmat.to(means.device, torch.float64)
+        center = -(pose[:3, :3].T @ pose[:3, 3])
+    moved = means + (center - settings.campos.to(means.device, torch.float64)).to(means.dtype)
+    values: Tensor = ShadeTable.apply(moved, shs.contiguous(), center, index, camera, settings.sh_degree)
+    return values
 
 
 class SparseGaussianAdam(torch.optim.Adam):
@@ -230,21 +255,6 @@ def dist2(points: Tensor) -> Tensor:
         InputError: Another shape, fewer than 4 points, or a point that is not finite.
     """
     return mean_squared_neighbor_distance(points)
-
-
-def _shade(p: ProjectedSplats, means3D: Tensor, shs: Tensor, settings: GaussianRasterizationSettings) -> Tensor:
-    """Colours of the rows of the table, NaN where they are not finite, which is left out."""
-    degree, campos = settings.sh_degree, settings.campos
-    if p.camera is not None and degree <= 3 and shs.dtype == torch.float32:
-        position = p.camera.position
-        off = (campos.detach().to(position) - position).abs().max()
-        if off <= CENTER_TOLERANCE * (1.0 + position.abs().max()):
-            center = campos.to(means3D.device, torch.float64)
-            colors: Tensor = ShadeTable.apply(means3D.contiguous(), shs.contiguous(), center, p.index, p.camera, degree)
-            return colors
-    directions = select_rows(means3D, p.index) - campos.to(means3D)
-    colors, shown = harmonic_colors(directions, select_rows(shs, p.index), degree)
-    return torch.where(shown[:, None], colors, torch.nan)
 
 
 def _check(

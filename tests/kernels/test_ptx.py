@@ -66,7 +66,9 @@ def test_the_list_of_kernels_is_complete():
     }
     assert factories <= names
     assert {"project_backward", "harmonics_backward", "sum_intersections", "sum_groups"} <= names
-    assert {"key_points", "list_pairs"} <= names
+    assert {"key_points", "list_pairs", "tabulate_neighbors"} <= names
+    assert {"convolve_blocks", "convolve_and_finish_blocks", "convolve_backward_blocks"} <= names
+    assert {"normalize_elements", "sum_normalized_blocks", "normalize_backward_elements"} <= names
 
 
 @pytest.fixture(scope="module")

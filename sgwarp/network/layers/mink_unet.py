@@ -48,9 +48,8 @@ class BasicBlock(nn.Module):
         y, x = normalized(self.conv1, self.norm1, x)
         shortcut = x
         if self.downsample is not None:
-            linear: Any = self.downsample[0]
-            norm: Any = self.downsample[1]
-            shortcut, _ = normalized(linear, norm, x, rectify=False)
+            layers: Any = self.downsample
+            shortcut, _ = normalized(layers[0], layers[1], x, rectify=False)
         return normalized(self.conv2, self.norm2, y, shortcut=shortcut)[0]
 
 
@@ -118,8 +117,8 @@ class MinkUNet(nn.Module):
         self, conv: str, norm: str, x: SparseTensor, beside: SparseTensor | None = None
     ) -> tuple[SparseTensor, SparseTensor]:
         layer: Any = self.get_submodule(conv)
-        norm_layer: Any = self.get_submodule(norm)
-        return normalized(layer, norm_layer, x, beside=beside)
+        following: Any = self.get_submodule(norm)
+        return normalized(layer, following, x, beside=beside)
 
     def forward(self, x: SparseTensor) -> SparseTensor:
         """Embedding of every voxel, [N, out_channels]; not normalised."""

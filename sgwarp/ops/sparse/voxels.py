@@ -150,14 +150,14 @@ class KernelMap:
     @property
     def sources(self) -> Tensor:
         """Row that is read, int64 [pairs]."""
-        first, second, _ = self._pairs
-        return second if self.turned else first
+        found, written, _ = self._pairs
+        return written if self.turned else found
 
     @property
     def targets(self) -> Tensor:
         """Row that is written, int64 [pairs]; no row twice within an offset."""
-        first, second, _ = self._pairs
-        return first if self.turned else second
+        found, written, _ = self._pairs
+        return found if self.turned else written
 
     @property
     def starts(self) -> tuple[int, ...]:
