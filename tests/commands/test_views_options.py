@@ -63,6 +63,7 @@ def test_photographs_and_world_reach_every_reading(stage, stage_files, tmp_path,
     monkeypatch.setattr("sgwarp.io.views.load_views", load_views)
     monkeypatch.setattr("sgwarp.rendering.agreement.find_placement", find_placement)
     monkeypatch.setattr("sgwarp.viewer.server.open_viewer", None)
+    monkeypatch.setattr("sgwarp.encoders.registry._kept", None)  # distill keeps encoders for the rest of its process
     names = {"scene": stage_files.scene, "views": stage_files.views, "labels": stage_files.labels}
     words = line.format(**names, semantics=semantics, data=data, out=tmp_path / "out").split()
     moved = ["--transform", str(move)] if places else []

@@ -88,6 +88,7 @@ def tint(tmp_path, monkeypatch):
     monkeypatch.syspath_prepend(tmp_path)
     monkeypatch.delitem(sys.modules, "tint_of_a_test", raising=False)
     monkeypatch.setitem(KINDS, ROW.name, ROW)
+    monkeypatch.setattr("sgwarp.encoders.registry._kept", None)
     return import_module("tint_of_a_test")
 
 

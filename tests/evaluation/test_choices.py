@@ -7,13 +7,14 @@ from types import SimpleNamespace
 import pytest
 import torch
 
-from sgwarp.datasets.base import SceneData
+from sgwarp.datasets.base import Query, SceneData
 from sgwarp.errors import InputError
 from sgwarp.evaluation import cases, networks
 from sgwarp.evaluation.answers import Answers
 from sgwarp.evaluation.evaluator import Evaluation
 from sgwarp.evaluation.networks import NetworkSettings
 from sgwarp.evaluation.profiles.catalogue import find_profile
+from sgwarp.evaluation.profiles.masks import score_phrases
 from sgwarp.evaluation.report_files import headline
 from sgwarp.evaluation.results import SceneResult
 from sgwarp.evaluation.settings import Settings
@@ -141,3 +142,41 @@ def test_seconds_of_the_headline_are_those_of_a_scene():
     found = Evaluation(find_profile("room"), Settings(), results, figures={"miou": 0.5})
     row = dict(zip(headline(found).columns, headline(found).rows[0], strict=True))
     assert (row["lifting [s]"], row["asking [s]"]) == ("6.00", "3.00")
+
+
+OTHER = {
+    **{"encoder": "files:x", "method": "center", "gaussians": "g", "semantics": "s", "predicted": "p"},
+    **{"ensemble": "mean", "scoring": "cosine", "classes": ("a",), "threshold": 0.7, "views": "released"},
+    **{"hold_out": 5, "every": 3, "share_of_views": 0.5, "share_of_gaussians": 0.5, "count": 7, "forgetting": 0.4},
+    **{"sheets": 0, "seed": 9, "device": "cuda", "cache": "maps"},
+}
+
+
+@pytest.mark.parametrize("name", OTHER)
+def test_results_belong_to_all_choices_but_where_they_are_computed_and_kept(name):
+    plain, changed = Settings(), replace(Settings(), **{name: OTHER[name]})
+    assert (changed.identity == plain.identity) == (name in ("device", "cache"))
+
+
+def test_choices_are_complete():
+    assert set(OTHER) | {"levels"} == {field.name for field in fields(Settings)}
+    levels = [Settings(encoder="files:{level}", levels=one).identity for one in (("s",), ("m",))]
+    assert levels[0] != levels[1]
+
+
+@pytest.mark.parametrize(("threshold", "found"), [(-9.0, 1.0), (0.5, None), (9.0, 0.0)])
+def test_a_phrase_is_where_the_scores_of_the_scene_exceed_the_threshold(stage, stage_files, toy_text, threshold, found):
+    """Below all scores everything is the object, above all of them nothing: the mask is that of the threshold."""
+    view = stage.views[2]
+    truth = stage.labels(view) == 3
+    queries = [Query(view.stem, "lamp", view.camera.size, lambda: truth, torch.zeros(0, 4))]
+    case = SimpleNamespace(
+        scene=SimpleNamespace(need=lambda what: lambda: queries, folder=Path("attic")),
+        **{"settings": Settings(sheets=0, threshold=threshold), "scored": [view], "log": RunLog(), "predicted": None},
+        **{"gaussians": stage_files.gaussians, "text": toy_text, "sources": []},
+        semantics=[lift(stage_files.gaussians, stage.views, stage.dense)],
+    )
+    result = SceneResult("attic")
+    score_phrases(case, result, Path("attic"))
+    expected = {1.0: pytest.approx(float(truth.float().mean())), 0.0: 0.0}.get(found)
+    assert result.figures["iou"] == expected if found is not None else result.figures["iou"] > 0.8

@@ -2,8 +2,10 @@
 
 import numpy as np
 import pytest
+from plyfile import PlyData, PlyElement
 
 from sgwarp.io.colors import unit_colors
+from sgwarp.io.points import load_points
 from sgwarp.io.sequences import load_sequence
 
 
@@ -46,3 +48,13 @@ def test_what_white_is(kind, values, white):
 def test_negative_colors_are_black_and_infinite_ones_decide_nothing():
     found = unit_colors(np.array([-0.5, 0.5, np.inf], np.float32))
     assert found[:2].tolist() == [0.0, 0.5]
+
+
+def test_points_that_are_not_finite_are_counted(tmp_path, caplog):
+    rows = np.zeros(9, dtype=[*((axis, "<f4") for axis in "xyz"), *((c, "u1") for c in ("red", "green", "blue"))])
+    rows["x"] = [0, 1, np.nan, 3, 4, np.inf, 6, 7, 8]
+    PlyData([PlyElement.describe(rows, "vertex")]).write(str(tmp_path / "points.ply"))
+    positions, colors = load_points(tmp_path / "points.ply")
+    assert positions[:, 0].tolist() == [0, 1, 3, 4, 6, 7, 8]
+    assert len(colors) == 7
+    assert "left out 2 of 9 points: not finite" in caplog.text

@@ -497,3 +497,21 @@ def test_maps_of_any_kind_are_taken(scene, truth):
     nothing = next(iter(track(Recorded(scene), lambda frame: scene.cameras, {})))
     with pytest.raises(InputError, match="no view had a feature map"):
         _ = nothing.semantics
+
+
+@pytest.mark.parametrize(
+    ("apart", "after"),
+    [
+        ({(0, 3)}, {(0, 3)}),  # of neither
+        ({(0, 2)}, {(0, 1)}),  # the other one first: 2 becomes 1
+        ({(2, 3)}, {(1, 3)}),  # the other one last
+        ({(0, 2), (2, 3), (0, 1)}, {(0, 1), (1, 3)}),
+    ],
+)
+def test_what_was_apart_from_an_object_is_apart_from_the_one_that_it_became(apart, after):
+    """Objects 1 and 2 become one; whoever was seen beside 2 was seen beside it."""
+    source = Associated(None)
+    source.count, source._apart, source._sums = 4, set(apart), LiftSums.zeros(2, 4)
+    assert source._join(1, 2, torch.tensor([2, -1]))
+    assert source._apart == after
+    assert not source._join(*min(after), torch.tensor([-1]))

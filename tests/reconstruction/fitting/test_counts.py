@@ -1,5 +1,6 @@
 """How many: points that a fit starts from, views that are measured, seconds of a run that was interrupted."""
 
+from dataclasses import replace
 from itertools import count
 from types import SimpleNamespace
 
@@ -12,10 +13,13 @@ from sgwarp.io.points import load_points
 from sgwarp.reconstruction.fitting import initial, loop, trainer
 from sgwarp.reconstruction.fitting.belongings import depth_from_folder
 from sgwarp.reconstruction.fitting.exposure import Exposure
+from sgwarp.reconstruction.fitting.frame import Frame
 from sgwarp.reconstruction.fitting.per_photograph import PerPhotograph
+from sgwarp.reconstruction.fitting.photographs import read_photographs
 from sgwarp.reconstruction.fitting.settings import FitSettings
 from sgwarp.reconstruction.fitting.trainer import fit
 from sgwarp.runs.log import RunLog
+from sgwarp.scene import Gaussians
 
 
 @pytest.mark.parametrize(
@@ -127,3 +131,25 @@ def test_what_all_photographs_share_belongs_to_the_scene():
     sums = sum(exposure.leaf(index).detach() for index in range(3))
     torch.testing.assert_close(sums, 3 * torch.eye(3, 4))
     torch.testing.assert_close(exposure.leaf(1).detach(), torch.eye(3, 4) + 0.2)
+
+
+@pytest.mark.parametrize(("behind", "unseen"), [(True, 4), (False, 0)])
+def test_updates_that_were_left_out_are_counted(boards, behind, unseen):
+    """Four Gaussians, all of them behind the cameras or all in front: in each of three steps."""
+    blank = Gaussians(*(torch.full((4, *shape), 0.1) for shape in ((3,), (4,), (3,), (), (1, 3))))
+    means = torch.tensor([[0.0, 0.0, -50.0 if behind else 3.0]]).expand(4, 3)
+    log = RunLog()
+    settings = FitSettings(steps=3, strategy="default", cap=1300, sh_degree=0)
+    run = loop.Loop(settings, read_photographs(boards.views[:3]), [], 1.0, torch.device("cpu"), log)
+    run.begin(replace(blank, means=means))
+    assert run.go(lambda *call: None, None, 1000, lambda: False)
+    assert log.left_out.get("updates_of_unseen_gaussians", 0) == 3 * unseen
+
+
+def test_the_frame_lies_around_the_mean_of_the_cameras(boards):
+    views = [boards.views[k] for k in (0, 1, 4)]
+    places = torch.stack([view.camera.position for view in views])
+    frame = Frame.around(views)
+    torch.testing.assert_close(frame.origin, places.mean(dim=0))
+    moved = torch.stack([frame.view(view).camera.position for view in views])
+    torch.testing.assert_close(moved.mean(dim=0), torch.zeros(3, dtype=torch.float64), rtol=0, atol=1e-9)
