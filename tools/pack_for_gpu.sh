@@ -1,7 +1,7 @@
 #!/bin/bash
 # Packs what a GPU machine without network needs: tools/pack_for_gpu.sh OUT [ARCHITECTURE] [PYTHON_VERSION]
 #
-#   OUT/warp.tar.xz      Warp, its native library with the machine code of one architecture only (some 50 MiB)
+#   OUT/warp.tar.xz      Warp, its native library with the machine code of one architecture only (some 70 MiB)
 #   OUT/clang.tar.xz     Warp's compiler for the CPU, which whatever runs on the CPU needs
 #   OUT/libraries.tar.xz plyfile, tyro and what they need
 #   OUT/project.tar.xz   this repository at HEAD, without pictures
@@ -12,6 +12,7 @@
 #        cd site/project && python -m benchmarks.gpu --page docs/gpu.md
 #        SGWARP_TEST_DEVICE=cuda python -m pytest tests/ops tests/compat
 # gsplat goes into a folder of its own, named in PYTHONPATH only for the comparison: the tests would compare with it.
+# Packing takes four minutes of processor time, on as many cores as there are.
 # Needs, here, bash, python3 with pip, xz and network; there torch, numpy, opencv, rich, safetensors and pytest.
 set -euo pipefail
 
