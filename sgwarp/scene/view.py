@@ -31,6 +31,7 @@ class View:
         mask_path: A mask of the photograph that the data set names, or None.
         depth_path: Depth of the photograph that the data set names, or None.
         depth_unit: What one step of that depth is, if its file holds whole numbers [m].
+        origin: Where its data set counts from the origin of the camera's world, if that was moved to it.
     """
 
     stem: str
@@ -41,6 +42,7 @@ class View:
     mask_path: Path | None = None
     depth_path: Path | None = None
     depth_unit: float = 1e-3
+    origin: tuple[float, float, float] | None = None
 
     def carry(self, array: Any, nearest: bool = True) -> Any:
         """What belongs to the photograph as stored, [h, w] or [h, w, C], as it belongs to the pinhole image.

@@ -160,7 +160,7 @@ def _read(view: View, size: tuple[int, int], masks: Masks | None, store: PixelSt
         if mask.shape != view.camera.size:
             got, want = list(mask.shape), list(view.camera.size)
             raise InputError(f"view {view.stem}: its mask has shape {got}, its photograph {want}; resize one of them")
-    pixels = view.pixels()
+    pixels: Any = view.pixels()
     alpha: Any = read_alpha(view.image_path)
     if alpha is not None and view.undistort is not None:
         alpha = view.undistort(np.repeat(alpha[..., None], 3, axis=2))[..., 0]

@@ -131,7 +131,7 @@ def fit(
         raise InputError(f"checkpoint_every: expected at least 1, got {checkpoint_every}")
     frame = Frame.around(views, start.means if isinstance(start, Gaussians) else None if start is None else start[0])
     store = PixelStore(device)
-    sizes = {"downscale": downscale, "largest": largest}
+    sizes: dict[str, Any] = {"downscale": downscale, "largest": largest}
     with log.stage("read"):
         photographs, shown = (
             read_photographs([*map(frame.view, group)], **sizes, masks=given, device=device, store=store)
