@@ -120,5 +120,5 @@ class View(SceneOptions):
         except InputError:
             views = find_views(self.views, images=self.images)
         if self.transform is None and views[0].origin is None:
-            return views  # type: ignore[return-value]
+            return views
         return place_views(gaussians, self.scene, views, self.transform)
