@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any, Literal
 
 import tyro
 
-from sgwarp.commands.options import Options, check_name, find_views
+from sgwarp.commands.options import Options, check_name, find_views, notices_held_back
 from sgwarp.commands.poses import find_poses
 from sgwarp.errors import InputError
 from sgwarp.runs.progress import show_progress
@@ -318,7 +318,7 @@ class Fit(Options):
         from sgwarp.io.posed_photographs import write_posed_photographs
         from sgwarp.io.scenes import save_gaussians
         from sgwarp.reconstruction.fitting.photographs import read_photographs
-        from sgwarp.reconstruction.fitting.report import draw_curve, write_contact_sheet
+        from sgwarp.reconstruction.fitting.report import draw_curve, sheet_rows, write_contact_sheet
 
         last = fitted.curve[-1]
         with log.stage("write"):
@@ -329,13 +329,15 @@ class Fit(Options):
                 log.outputs.append(str(write_posed_photographs(folder, fitted.views)))
             if held_out:
                 sheet = self.out.with_name(f"{self.out.stem}.held_out.jpg")
-                photographs = read_photographs(
-                    fitted.held_out_views or held_out,
-                    downscale=self.downscale,
-                    largest=self.max_size,
-                    masks=masks,
-                    device=self.device,
-                )
+                shown = list(fitted.held_out_views or held_out)
+                with notices_held_back():  # they were said when the fit read them
+                    photographs = read_photographs(
+                        [shown[index] for index in sheet_rows(len(shown))],
+                        downscale=self.downscale,
+                        largest=self.max_size,
+                        masks=masks,
+                        device=self.device,
+                    )
                 write_contact_sheet(fitted.gaussians, photographs, sheet, white=self.background == "white")
                 log.outputs.append(str(sheet))
             if held_out and _has_matplotlib():

@@ -119,4 +119,6 @@ class View(SceneOptions):
             views = find_views(self.views, photographs=False, images=self.images)
         except InputError:
             views = find_views(self.views, images=self.images)
-        return views if self.transform is None else place_views(gaussians, self.scene, views, self.transform)
+        if self.transform is None and views[0].origin is None:
+            return views
+        return place_views(gaussians, self.scene, views, self.transform)

@@ -37,6 +37,7 @@ REST_COUNTS = tuple(3 * (k - 1) for k in SH_COUNTS)  # 0, 9, 24, 45
 
 # Below the logarithm of the smallest float32 (1.4e-45, -103.3): exp() and sigmoid() of it are exactly 0 again.
 LOG_ZERO = -110.0
+SAMPLED, COARSE = 16, 0.2  # every so many rows are looked at; steps of float32 that matter [size of a Gaussian]
 ROWS_PER_BLOCK = 16384  # a block of 62 columns fits the cache, so that rows are fetched from memory once
 
 
@@ -262,7 +263,23 @@ def build_gaussians(
             gaussians.non_finite,
             len(gaussians),
         )
+    _say_coarse(path, means[::SAMPLED].numpy(), scales[::SAMPLED].numpy())
     return gaussians
+
+
+def _say_coarse(path: str | os.PathLike[str], means: NDArray[np.float32], scales: NDArray[np.float32]) -> None:
+    """Log where coordinates are so large that float32 moves Gaussians by much of their size, as those of countries."""
+    finite = np.isfinite(means).all(axis=1) & np.isfinite(scales).all(axis=1)
+    if not finite.any():
+        return
+    farthest, size = (float(np.median(values[finite].max(axis=1))) for values in (np.abs(means), scales))
+    step = farthest * float(np.finfo(np.float32).eps)
+    if step > COARSE * size > 0:
+        logging.getLogger("sgwarp").warning(
+            "%s: lies so far from the origin (%g) that its positions are known to %.2g, its Gaussians of size %.2g are "
+            "torn apart; move it near the origin where it was made",
+            *(path, farthest, step, size),
+        )
 
 
 def host_arrays(gaussians: Gaussians) -> tuple[NDArray[np.float32], ...]:

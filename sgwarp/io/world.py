@@ -63,7 +63,8 @@ def moved_near_origin(source: Path, views: Sequence[View]) -> list[View]:
 def _moved(view: View, origin: torch.Tensor) -> View:
     pose = view.camera.world_to_camera.clone()
     pose[:3, 3] += pose[:3, :3] @ origin
-    return replace(view, camera=replace(view.camera, world_to_camera=pose))
+    x, y, z = origin.tolist()
+    return replace(view, camera=replace(view.camera, world_to_camera=pose), origin=(x, y, z))
 
 
 def transform_of_points(transforms: Path, meta: Mapping[str, Any], model: Path) -> Array | None:

@@ -114,10 +114,12 @@ def find_placement(
     matrix = None if transform is None else read_world_transform(transform)
     if not len(gaussians):
         return matrix  # nothing can match
+    matrix = _from_their_own_origin(gaussians, scene, views, matrix)
     found = compare(gaussians, views if matrix is None else moved_views(views, matrix))
     beside = scene.parent / BESIDE
     if not found.matches and transform is None and beside.is_file():
         tried = read_world_transform(beside)
+        tried = tried if matrix is None else tried @ matrix
         better = compare(gaussians, moved_views(views, tried))
         if better.correlation > found.correlation + CLEAR:
             logger.warning(
@@ -129,6 +131,27 @@ def find_placement(
     if not found.matches:
         _say(scene, found)
     return matrix
+
+
+def _from_their_own_origin(
+    gaussians: Gaussians, scene: Path, views: Sequence[View], matrix: NDArray[np.float64] | None
+) -> NDArray[np.float64] | None:
+    """The transform for a scene that was left in the coordinates of a country, where its views were moved from.
+
+    A scene that sgwarp fitted lies near the origin, as its views do; that of another trainer may not.
+    """
+    means = gaussians.means.detach()[gaussians.finite].double().cpu().numpy()
+    if not views or views[0].origin is None or not len(means):
+        return matrix
+    back = np.eye(4)
+    back[:3, 3] = views[0].origin
+    given = np.eye(4) if matrix is None else matrix
+    middle = np.append(np.mean([view.camera.position.numpy() for view in views], axis=0), 1.0)
+    moved, own = (np.linalg.norm((way @ middle)[:3] - np.median(means, axis=0)) for way in (given, given @ back))
+    if moved <= own:
+        return matrix
+    logger.info("%s: lies far from the origin as the data set does; its views are moved back there", scene)
+    return given @ back
 
 
 def _say(scene: Path, found: Agreement) -> None:

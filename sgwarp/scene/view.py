@@ -7,7 +7,9 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import torch
+from numpy.typing import NDArray
 from torch import Tensor
 
 from sgwarp.errors import InputError
@@ -29,6 +31,7 @@ class View:
         mask_path: A mask of the photograph that the data set names, or None.
         depth_path: Depth of the photograph that the data set names, or None.
         depth_unit: What one step of that depth is, if its file holds whole numbers [m].
+        origin: Where its data set counts from the origin of the camera's world, if that was moved to it.
     """
 
     stem: str
@@ -39,6 +42,7 @@ class View:
     mask_path: Path | None = None
     depth_path: Path | None = None
     depth_unit: float = 1e-3
+    origin: tuple[float, float, float] | None = None
 
     def carry(self, array: Any, nearest: bool = True) -> Any:
         """What belongs to the photograph as stored, [h, w] or [h, w, C], as it belongs to the pinhole image.
@@ -59,6 +63,14 @@ class View:
         """Read the photograph, float32 [H, W, 3] in [0, 1].
 
         Raises:
+            InputError: As `pixels` says.
+        """
+        return torch.from_numpy(self.pixels()).to(torch.float32) / 255.0
+
+    def pixels(self) -> NDArray[np.uint8]:
+        """Read the photograph, uint8 [H, W, 3].
+
+        Raises:
             InputError: There is none, it cannot be read, or its size is not the camera's.
         """
         if self.image_path is None:
@@ -69,4 +81,4 @@ class View:
         if pixels.shape[:2] != self.camera.size:
             got, want = f"{pixels.shape[1]} x {pixels.shape[0]}", f"{self.camera.width} x {self.camera.height}"
             raise InputError(f"{self.image_path}: image is {got}, its camera says {want}; resize one of them")
-        return torch.from_numpy(pixels).to(torch.float32) / 255.0
+        return pixels

@@ -158,6 +158,14 @@ def test_fit_writes_the_sheet_of_what_it_held_out(stopped, photographs, tmp_path
     assert (path, call.white) == (tmp_path / "s.held_out.jpg", True)
 
 
+@pytest.mark.parametrize("hides", ["black", "white"])
+def test_fit_masks_hide_what_is_asked_for(stopped, photographs, tmp_path, hides):
+    target = "sgwarp.reconstruction.fitting.belongings.masks_from_folder"
+    options = ["--out", tmp_path / "s.ply", "--masks", photographs.masks, "--mask-hides", hides]
+    folder, views, asked = stopped(target, "fit", photographs.views, *options).positional
+    assert (folder, len(views), asked) == (photographs.masks, 6, hides)
+
+
 @pytest.fixture
 def boards_points(tmp_path):
     from plyfile import PlyData, PlyElement

@@ -483,3 +483,14 @@ def test_a_folder_that_holds_scenes_names_the_last(tmp_path, ply_bytes):
     (tmp_path / "alone/a.spz").write_bytes(b"")
     with pytest.raises(InputError, match=r"is a folder; give its scene, .*alone/a\.spz"):
         load_gaussians(tmp_path / "alone")
+
+
+@pytest.mark.parametrize(("shift", "said"), [(0.0, False), (1e3, False), (5.4e6, True)])
+def test_positions_that_float32_cannot_hold_are_said(tmp_path, ply_bytes, caplog, shift, said):
+    """In UTM coordinates, steps of 0.5 m between Gaussians of 0.14 m, whatever type the columns have."""
+    rows = raw_rows(CORE)
+    for row in rows:
+        row["x"] += shift
+        row.update({f"scale_{axis}": -2.0 for axis in range(3)})
+    load_gaussians(scene_file(ply_bytes, tmp_path / "a.ply", rows, kinds=["double"] * len(rows[0])))
+    assert ("lies so far from the origin" in caplog.text) is said

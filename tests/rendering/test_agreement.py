@@ -212,3 +212,31 @@ def test_a_moving_scene_elsewhere(stage, stage_files, elsewhere, warned):
     assert (found == stage.labels(view).numpy()).mean() > 0.9
     runs(*parts)
     assert "do not match" in warned()
+
+
+@pytest.mark.parametrize("left_there", [True, False])
+def test_a_scene_may_be_left_far_from_the_origin(stage_files, tmp_path, warned, left_there):
+    """Views are moved near the origin; a scene of another trainer is not, one of `sgwarp fit` is."""
+    far = np.array([5000.0, -7000.0, 300.0])
+    meta = json.loads((stage_files.views / "transforms.json").read_text())
+    for frame in meta["frames"]:
+        pose = np.array(frame["transform_matrix"])
+        pose[:3, 3] += far
+        frame["transform_matrix"] = pose.tolist()
+    (tmp_path / "transforms.json").write_text(json.dumps(meta))
+    for path in stage_files.views.iterdir():
+        if path.name != "transforms.json":
+            (tmp_path / path.name).symlink_to(path)
+    views = load_views(tmp_path)
+    origin = np.array(views[0].origin)
+    shift = torch.from_numpy(far - (0 if left_there else origin)).float()
+    scene = replace(stage_files.gaussians, means=stage_files.gaussians.means + shift)
+    placed = find_placement(scene, tmp_path / "scene.ply", views)
+    expected = np.eye(4)
+    expected[:3, 3] = origin
+    if left_there:
+        np.testing.assert_allclose(placed, expected)
+    else:
+        assert placed is None
+    assert compare(scene, views if placed is None else moved_views(views, placed)).correlation > 0.9
+    assert "do not match" not in warned()

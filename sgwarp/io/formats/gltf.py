@@ -47,11 +47,14 @@ def read_gltf(path: str | os.PathLike[str], axes: str = GLTF_AXES) -> Gaussians:
         InputError: The file is missing or damaged, or holds no Gaussians.
     """
     document = read_document(path)
-    parts = [
-        move_gaussians(_primitive(document, primitive), matrix)
-        for primitive, matrix in _primitives(document)
-        if EXTENSION in _mapping(primitive.get("extensions"))
-    ]
+    parts = []
+    for primitive, matrix in _primitives(document):
+        if EXTENSION in _mapping(primitive.get("extensions")):
+            gaussians = _primitive(document, primitive)
+            try:
+                parts.append(move_gaussians(gaussians, matrix))
+            except InputError as error:
+                raise InputError(f"{path}: a node moves its Gaussians, but {error}") from None
     if not parts:
         raise InputError(
             f"{path}: holds no primitive with {EXTENSION}; it is a mesh or a point cloud, not a 3DGS scene"
@@ -70,7 +73,8 @@ def _list(value: Any) -> list[Any]:
 def _primitives(document: Document) -> Iterator[tuple[Mapping[str, Any], NDArray[np.float64]]]:
     """Every primitive of the scene, and the matrix of its node."""
     nodes, scenes = document.rows("nodes"), document.rows("scenes")
-    roots = _mapping(scenes[0]).get("nodes") if scenes else list(range(len(nodes)))
+    chosen = document.meta.get("scene", 0)
+    roots = document.row("scenes", chosen).get("nodes") if scenes else list(range(len(nodes)))
     waiting = [(root, np.eye(4), 0) for root in _list(roots)]
     seen: set[int] = set()
     if not nodes:  # meshes that no node places
@@ -135,7 +139,8 @@ def _primitive(document: Document, primitive: Mapping[str, Any]) -> Gaussians:
 
     def values(name: str, width: int) -> NDArray[np.float32]:
         if name not in attributes:
-            raise InputError(f"{document.path}: a primitive with {EXTENSION} lacks the attribute {name}")
+            draft = "; it follows a draft of the extension, export it again" if "_SCALE" in attributes else ""
+            raise InputError(f"{document.path}: a primitive with {EXTENSION} lacks the attribute {name}{draft}")
         return document.accessor(attributes[name], width, name)
 
     means = values("POSITION", 3)

@@ -69,6 +69,7 @@ def read_photographs(
     masks: Masks | None = None,
     device: str | torch.device = "cpu",
     progress: Report | None = None,
+    store: PixelStore | None = None,
 ) -> list[Photograph]:
     """Read all photographs; those that cannot be used or whose mask leaves nothing are left out, with a notice.
 
@@ -77,6 +78,9 @@ def read_photographs(
         downscale: Divide width and height by this; pixels are averaged.
         largest: Photographs that are then wider or higher are scaled down to this, with a notice [pixels]; 0 for none.
         masks: Which pixels of a view count, [H, W] of its photograph, zero for those that do not; or None for all.
+        device: Where the pixels go.
+        progress: Called as `progress(done, total, name)`.
+        store: Takes the pixels; one for all photographs of a run bounds their memory together.
 
     Raises:
         InputError: A view has no photograph, or none of the photographs can be used.
@@ -90,7 +94,7 @@ def read_photographs(
     failed: list[InputError] = []
     hidden: list[str] = []
     dark: list[Path] = []
-    store = PixelStore(device)
+    store = store or PixelStore(device)
     report(0, len(views), "")
     for done, view in enumerate(views, start=1):
         if view.image_path is None:
@@ -156,7 +160,7 @@ def _read(view: View, size: tuple[int, int], masks: Masks | None, store: PixelSt
         if mask.shape != view.camera.size:
             got, want = list(mask.shape), list(view.camera.size)
             raise InputError(f"view {view.stem}: its mask has shape {got}, its photograph {want}; resize one of them")
-    pixels = (view.image().numpy() * 255.0).round().astype(np.uint8)
+    pixels: Any = view.pixels()
     alpha: Any = read_alpha(view.image_path)
     if alpha is not None and view.undistort is not None:
         alpha = view.undistort(np.repeat(alpha[..., None], 3, axis=2))[..., 0]

@@ -11,7 +11,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-IN_MEMORY = 2**31  # bytes of photographs that are kept in memory
+IN_MEMORY = 2**30  # bytes of photographs that are kept in memory
 
 
 class PixelStore:

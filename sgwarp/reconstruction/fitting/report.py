@@ -26,6 +26,11 @@ INK, ACCENT = "#222222", "#2d6cb5"
 DPI = 150
 
 
+def sheet_rows(count: int) -> list[int]:
+    """Which of so many photographs a contact sheet shows, evenly spread."""
+    return sorted(set(np.linspace(0, count - 1, min(MOST_ROWS, count)).round().astype(int).tolist()))
+
+
 def write_contact_sheet(
     gaussians: Gaussians, photographs: Sequence[Photograph], path: Path, *, white: bool = False
 ) -> None:
@@ -37,8 +42,7 @@ def write_contact_sheet(
         path: .png or .jpg to write.
         white: The background is white instead of black.
     """
-    chosen = np.unique(np.linspace(0, len(photographs) - 1, min(MOST_ROWS, len(photographs))).round().astype(int))
-    rows = [_row(gaussians, photographs[index], white) for index in chosen]
+    rows = [_row(gaussians, photographs[index], white) for index in sheet_rows(len(photographs))]
     width = max(row.shape[1] for row in rows)
     padded = [np.pad(row, ((0, GAP), (0, width - row.shape[1]), (0, 0)), constant_values=255) for row in rows]
     write_rgb(path, np.concatenate(padded))

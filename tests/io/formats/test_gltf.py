@@ -167,3 +167,32 @@ def test_only_binary_is_written(tmp_path, scene):
     with pytest.raises(InputError, match=r"written as \.glb"):
         write_gltf(scene(), tmp_path / "a.gltf")
     assert np.array_equal(list(tmp_path.iterdir()), [])
+
+
+def test_the_scene_that_the_file_chooses_is_read(tmp_path):
+    def second(meta):
+        meta["nodes"].append({"mesh": 0, "translation": [10, 0, 0]})
+        meta["scenes"].append({"nodes": [1]})
+        meta["scene"] = 1
+
+    scene = read_gltf(document(tmp_path, two_gaussians(), change=second), axes="rdf")
+    assert scene.means.tolist() == [[11, 2, 3], [14, 5, 6]]
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        (lambda m: m.update(extensionsRequired=["EXT_meshopt_compression"]), "packed with EXT_meshopt_.*without"),
+        (lambda m: m["nodes"][0].update(scale=[2, 1, 1]), r"a\.gltf: a node moves its Gaussians, but the transform"),
+        (lambda m: m.update(scene=5), r"refers to scenes\[5\]"),
+    ],
+)
+def test_what_a_file_may_ask_for_and_is_not_read(tmp_path, change, message):
+    with pytest.raises(InputError, match=message):
+        read_gltf(document(tmp_path, two_gaussians(), change=change))
+
+
+def test_a_draft_of_the_extension_is_named(tmp_path):
+    attributes = {key.replace(f"{NAME}:", "_"): value for key, value in two_gaussians().items()}
+    with pytest.raises(InputError, match=r"lacks the attribute .*:ROTATION; it follows a draft of the extension"):
+        read_gltf(document(tmp_path, attributes))
