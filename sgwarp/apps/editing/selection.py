@@ -48,7 +48,7 @@ class Selection:
         threshold: Least score of a text, where 0 is the scene's median and 1 its best thousandth. What scores more than
             half of it and is connected with such Gaussians belongs to them.
         grow: Add what lies within this distance, or if negative take away what lies within it of the rest [m].
-        clean: Leave out scattered pieces of each text, id, box and click that hold less than a tenth of its largest one.
+        clean: Leave out scattered pieces of each text, id, box and click that hold less than a tenth of the largest.
 
     Raises:
         InputError: A term is malformed, or a number not finite.
