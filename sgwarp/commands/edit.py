@@ -130,7 +130,8 @@ class Edit(SceneOptions):
             log.outputs += [str(self.out), str(script)]
             self._draw(gaussians, state.gaussians, drawn, log)
             changed = len(gaussians) - len(state.gaussians)
-            print(f"{len(steps)} steps; {len(gaussians)} Gaussians before, {len(state.gaussians)} after")
+            counted = f"{len(steps)} step" + "s" * (len(steps) != 1)
+            print(f"{counted}; {len(gaussians)} Gaussians before, {len(state.gaussians)} after")
             log.leave_out("gaussians_removed", max(changed, 0))
 
     def _write(self, state: EditState, columns: Mapping[str, Any] | None) -> None:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import errno
 import os
 import stat
 from collections.abc import Iterator
@@ -34,8 +33,6 @@ def reading(path: str | os.PathLike[str]) -> Iterator[None]:
             f"{path}: needs more memory than there is; use a machine with more, or a smaller file"
         ) from None
     except OSError as error:
-        if error.errno == errno.ENODEV and os.path.isdir(path):  # what mapping a folder into memory gives
-            raise InputError(f"{path}: is a folder; give the name of a file") from None
         raise InputError(f"{path}: cannot be read ({error.strerror or error})") from None
 
 

@@ -98,3 +98,21 @@ def test_an_ablation_lifts_anew(words, capsys):
         patch.setattr(EVALUATE, lambda *rest, **options: pytest.fail("evaluated before it was refused"))
         assert main([*map(str, words), "--ablate", "modes", "--semantics", "s"]) == 2
     assert "--ablate: lifts anew each time; leave --semantics out" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(
+    ("more", "message"),
+    [
+        (["--threshold", "nan"], "--threshold: expected a finite number"),
+        (["--threshold", "inf"], "--threshold: expected a finite number"),
+        (["--forgetting", "5"], "--forgetting: expected 0 to 1"),
+        (["--forgetting", "nan"], "--forgetting: expected 0 to 1"),
+        (["--epochs", "0", "--ablate", "inputs"], "--epochs: expected 1 or more"),
+        (["--train", "others"], "--train others: goes with --ablate inputs"),
+        (["--train", "others", "--ablate", "views"], "--train others: goes with --ablate inputs"),
+    ],
+)
+def test_values_without_sense_are_refused_before_the_work(words, monkeypatch, capsys, more, message):
+    monkeypatch.setattr(EVALUATE, lambda *rest, **options: pytest.fail("evaluated before it was refused"))
+    assert main([*map(str, words), *more]) == 2
+    assert message in capsys.readouterr().err
