@@ -175,6 +175,9 @@ def choose_scenes(
         unknown = [name for name in wanted if name not in there]
         if unknown:
             raise InputError(f"{data}: has no scene '{unknown[0]}'; there are: {', '.join(there[:8])}")
+        twice = next((name for name in wanted if list(wanted).count(name) > 1), None)
+        if twice is not None:  # it would count twice in every mean
+            raise InputError(f"--scenes: '{twice}' stands there twice; leave one")
         return list(wanted), []
     listed = [name for name in profile.scenes if name in there]
     if profile.scenes and not listed:

@@ -65,6 +65,8 @@ def files(stage, stage_files, tmp_path_factory):
         ("--script FOLDER/edited.ops.json --undo 1", "has 1 steps; leave at least one"),
         ("--script FOLDER/edited.ops.json --undo -1", "has 1 steps; leave at least one"),
         ("--select id:1 --remove --undo 1", "needs --script"),
+        ("--select id:1 --remove --select id:2", "--select: is given 2 times; write all values after one --select"),
+        ("--select id:1 --keep=id:2 --remove --keep id:3", "--keep: is given 2 times"),
     ],
 )
 def test_odd_edits(stage_files, files, tmp_path, capsys, options, message):
