@@ -13,6 +13,7 @@ import shlex
 import sys
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager, suppress
+from dataclasses import fields
 from pathlib import Path
 from typing import Any
 
@@ -71,6 +72,7 @@ def _run(argv: list[str]) -> int:
 
     description = f"Open-vocabulary understanding of 3D Gaussian Splatting scenes, version {__version__}."
     command = tyro.extras.subcommand_cli_from_dict(dict(COMMANDS), prog="sgwarp", description=description, args=argv)
+    _refuse_second_lists(command, argv)
     command.command_line = shlex.join(["sgwarp", *argv])
     with _notices():
         try:
@@ -78,6 +80,19 @@ def _run(argv: list[str]) -> int:
         except InputError as error:
             raise InputError(_as_option(str(error), vars(command))) from error
     return code or 0
+
+
+def _refuse_second_lists(command: Any, argv: list[str]) -> None:
+    """Refuse an option with a list of values that is given twice: only the values after the last one would count.
+
+    Raises:
+        InputError: There is one.
+    """
+    given = [word.partition("=")[0].replace("_", "-") for word in argv if word.startswith("--")]
+    for one in fields(command):
+        option = f"--{one.name.replace('_', '-')}"
+        if "..." in str(one.type) and given.count(option) > 1:
+            raise InputError(f"{option}: is given {given.count(option)} times; write all values after one {option}")
 
 
 def _as_option(message: str, given: dict[str, Any]) -> str:

@@ -141,6 +141,10 @@ class Batch:
         pairs = [pair.partition("=") for pair in self.options]
         if wrong := [f"{key}{sign}{value}" for key, sign, value in pairs if not (key and sign)]:
             raise InputError(f"--options: expected option=value, got {wrong[0]!r}")
+        names = [one.partition("=")[0] for one in self.options]
+        twice = next((name for name in names if names.count(name) > 1), None)
+        if twice is not None:
+            raise InputError(f"--options: '{twice}' stands there twice; leave one")
         options = {key: value for key, _, value in pairs}
         plan = Plan(tuple(filter(None, self.do.split(","))), options, self.device)
         limits = Limits(self.time_limit, None if self.memory_limit is None else int(self.memory_limit * 1e9))

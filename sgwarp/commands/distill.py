@@ -136,6 +136,7 @@ class Distill(Options):
             log.outputs += [str(self.out), *map(str, curves)]
             log.write(self.out.parent)
             print(log.summary())
+            print(log.where())
 
     def _settings(self) -> DistillSettings:
         from sgwarp.network.augmentation import Augmentation

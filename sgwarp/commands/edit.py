@@ -7,6 +7,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from sgwarp.commands.inputs_kept import keep_photographs
 from sgwarp.commands.options import SceneOptions, check_name, find_view, find_views, load_on, place_views
 from sgwarp.errors import InputError
 
@@ -118,6 +119,7 @@ class Edit(SceneOptions):
             drawn = None
             if self.views is not None and self.view is not None:
                 drawn = find_view(context.views, self.view, self.views)
+                keep_photographs("--out", [self.out.with_name(f"{self.out.stem}.png")], context.views)
             with log.stage("edit"):
                 state = edit(gaussians, steps, context)
             columns = None if self.plain else gaussians.extras
@@ -128,7 +130,8 @@ class Edit(SceneOptions):
             log.outputs += [str(self.out), str(script)]
             self._draw(gaussians, state.gaussians, drawn, log)
             changed = len(gaussians) - len(state.gaussians)
-            print(f"{len(steps)} steps; {len(gaussians)} Gaussians before, {len(state.gaussians)} after")
+            counted = f"{len(steps)} step" + "s" * (len(steps) != 1)
+            print(f"{counted}; {len(gaussians)} Gaussians before, {len(state.gaussians)} after")
             log.leave_out("gaussians_removed", max(changed, 0))
 
     def _write(self, state: EditState, columns: Mapping[str, Any] | None) -> None:
@@ -142,6 +145,10 @@ class Edit(SceneOptions):
     def _replayed(self, steps: tuple[EditStep, ...]) -> tuple[EditStep, ...]:
         if self.select or self._operations():
             raise InputError("--script: already says what to do; leave out --select and the operations")
+        for name in ("keep", "negatives", "threshold", "grow", "clean"):
+            if getattr(self, name) != getattr(type(self), name):
+                option = "--no-clean" if name == "clean" else f"--{name}"
+                raise InputError(f"{option}: goes with --select; a script says for each step what it is applied to")
         if not 0 <= self.undo < len(steps):
             raise InputError(
                 f"--undo {self.undo}: {self.script} has {len(steps)} steps; leave at least one, before it the scene is "

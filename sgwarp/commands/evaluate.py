@@ -135,6 +135,10 @@ class Evaluate(Options):
             from sgwarp.evaluation.report_files import headline, write_tables
 
             axes = None if self.ablate is None else self._axes()
+            if self.epochs < 1:
+                raise InputError(f"--epochs: expected 1 or more, got {self.epochs}")
+            if self.train is not None and "inputs" not in (axes or ()):
+                raise InputError(f"--train {self.train}: goes with --ablate inputs, whose networks learn from it")
             profile = find_profile(self.profile)
             settings = self._settings(profile)
             with show_progress("evaluate") as progress:

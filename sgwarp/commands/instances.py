@@ -6,7 +6,16 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
-from sgwarp.commands.options import SceneOptions, check_folder, check_name, find_views, photograph, place_views
+from sgwarp.commands.inputs_kept import keep_maps, keep_photographs
+from sgwarp.commands.options import (
+    SceneOptions,
+    check_folder,
+    check_name,
+    find_views,
+    photograph,
+    place_views,
+    require_no_lift,
+)
 from sgwarp.errors import InputError
 from sgwarp.runs.progress import show_progress
 
@@ -88,6 +97,7 @@ class Instances(SceneOptions):
             gaussians = self.load_scene(log)
             semantics = self._semantics(gaussians, log)
             views = find_views(self.views, images=self.images)
+            drawn = self._drawn(views)
             with log.stage("compare"):
                 views = place_views(gaussians, self.scene, views, self.transform)
             with log.stage("load_masks"):
@@ -109,12 +119,13 @@ class Instances(SceneOptions):
             log.error["instances"] = len(found.table)
             log.error["bytes_per_gaussian"] = self.out.stat().st_size / len(gaussians)
             self._write_scene(gaussians, found, log)
-            self._render(gaussians, views, found, log)
+            self._render(gaussians, views if self.render_views is None else drawn, found, log)
             print(listing(found))
 
     def _check(self) -> None:
         """Refuse what cannot be written or does not go together, before the work is done."""
         check_name("--out", self.out, ".safetensors")
+        require_no_lift(self.out)
         if self.ply is not None:
             check_name("--ply", self.ply, ".ply")
             if self.ply.resolve() == self.scene.resolve():
@@ -123,6 +134,7 @@ class Instances(SceneOptions):
             raise InputError("--render-views: needs --render-out, the folder for the id maps")
         if self.render_out is not None:
             check_folder("--render-out", self.render_out)
+            keep_maps("--render-out", self.render_out, self.masks)
         if self.semantics is None and (self.classes is not None or self.least_cosine is not None):
             raise InputError("--classes and --least-cosine need --semantics, what `sgwarp lift` wrote for this scene")
 
@@ -183,6 +195,16 @@ class Instances(SceneOptions):
             save_instance_scene(gaussians.to("cpu"), found, self.ply)
         log.outputs.append(str(self.ply))
 
+    def _drawn(self, views: list[View]) -> list[View]:
+        """The views to draw maps of, before the work is done: no map takes the place of a photograph."""
+        if self.render_out is None:
+            return []
+        drawn = views if self.render_views is None else find_views(self.render_views, images=self.images)
+        folders = (self.render_out, self.render_out / "pictures")
+        maps = (folder / f"{view.stem}.png" for folder in folders for view in drawn)
+        keep_photographs("--render-out", maps, [*views, *drawn])
+        return drawn
+
     def _render(self, gaussians: Gaussians, views: list[View], found: InstanceMap, log: RunLog) -> None:
         """Id maps and pictures of the views asked for, or of those that gave the masks."""
         if self.render_out is None:
@@ -195,7 +217,6 @@ class Instances(SceneOptions):
         if len(found.table) > 65535:
             raise InputError(f"--render-out: {len(found.table)} instances do not fit 16-bit images")
         if self.render_views is not None:
-            views = find_views(self.render_views, images=self.images)
             views = place_views(gaussians, self.scene, views, self.transform)
         with show_progress("render") as progress:
             progress(0, len(views), "")

@@ -35,11 +35,14 @@ class Options:
 
     @contextmanager
     def logged(self, folder: Path) -> Iterator[RunLog]:
-        """Yield the log of this run; `run.json` goes into `folder` if the block succeeds, and one line to stdout."""
+        """Yield the log of this run. If the block succeeds, `run.json` goes into `folder`, and to stdout two lines:
+        times and figures, and where the results lie."""
         log = self.start()
         yield log
         log.write(folder)
         print(log.summary())
+        if log.where():
+            print(log.where())
 
     def start(self) -> RunLog:
         """Set the threads and the device.

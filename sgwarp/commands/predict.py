@@ -6,6 +6,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Literal
 
+from sgwarp.commands.inputs_kept import keep_file
 from sgwarp.commands.options import SceneOptions, check_name, load_on, require_no_lift
 
 if TYPE_CHECKING:
@@ -43,6 +44,7 @@ class Predict(SceneOptions):
     def run(self) -> None:
         check_name("--out", self.out, ".safetensors")
         require_no_lift(self.out)
+        keep_file("--out", self.out, self.net)
         with self.logged(self.out.parent) as log:
             from sgwarp.io.store import save_semantics
 

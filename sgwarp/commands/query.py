@@ -7,7 +7,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Literal
 
-from sgwarp.commands.options import SemanticsOptions, check_name, find_views, photograph, place_views
+from sgwarp.commands.inputs_kept import keep_photographs
+from sgwarp.commands.options import SemanticsOptions, check_name, find_view, find_views, photograph, place_views
 from sgwarp.errors import InputError
 
 if TYPE_CHECKING:
@@ -67,7 +68,10 @@ class Query(SemanticsOptions):
 
             gaussians, semantics = self.load_both(log)
             predicted = self.load_predicted(gaussians, log)
-            views = find_views(self.views, self.view, images=self.images)
+            views = find_views(self.views, images=self.images)
+            heat = self.out.with_name(f"{self.out.stem}_heat.png")
+            keep_photographs("--out", (self.out, heat), views)
+            views = [find_view(views, self.view, self.views)]
             (view,) = place_views(gaussians, self.scene, views, self.transform)
             scores = self._scores(semantics, predicted, log)
             with log.stage("splat"):
@@ -77,7 +81,6 @@ class Query(SemanticsOptions):
             mask = score_map > self.threshold
             print(f"{self.text}: best pixel ({x}, {y}), score {score_map[y, x]:.3f}; mask {mask.float().mean():.2%}")
             with log.stage("write"):
-                heat = self.out.with_name(f"{self.out.stem}_heat.png")
                 picture = heat_map(photograph(gaussians, view), score_map, low=0.0, high=1.0)
                 write_ids(self.out, mask.byte().mul(255).cpu())
                 write_rgb(heat, mark_pixel(picture, (x, y)))

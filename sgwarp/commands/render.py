@@ -6,6 +6,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Literal
 
+from sgwarp.commands.inputs_kept import keep_photographs
 from sgwarp.commands.options import SceneOptions, check_folder, find_views, notices_held_back
 from sgwarp.errors import InputError
 from sgwarp.runs.progress import show_progress
@@ -71,9 +72,11 @@ class Render(SceneOptions):
                     with log.stage("render"):
                         image = render(gaussians, view.camera, self.mode, background=background, log=log)
                     with log.stage("write"):
-                        path = self.out if folder != self.out else folder / f"{view.stem}.png"
-                        log.outputs += self._write(path, image.cpu())
+                        log.outputs += self._write(self._picture(view), image.cpu())
                     progress(done, len(views), view.stem)
+
+    def _picture(self, view: View) -> Path:
+        return self.out if self.out.suffix == ".png" else self.out / f"{view.stem}.png"
 
     def _views(self, gaussians: Gaussians) -> list[View]:
         if self.views is None:
@@ -96,9 +99,12 @@ class Render(SceneOptions):
         assert self.views is not None
         try:
             with notices_held_back():  # those of the same views have been shown
-                compared = find_views(self.views, self.view, images=self.images)
+                photographed = find_views(self.views, images=self.images)
         except InputError:
-            compared = views
+            photographed = views
+        keep_photographs("--out", map(self._picture, views), photographed)
+        drawn = {view.stem for view in views}
+        compared = [view for view in photographed if view.stem in drawn] or views
         views, compared = (with_near_plane_of(group, gaussians) for group in (views, compared))
         matrix = find_placement(gaussians, self.scene, compared, self.transform)
         return views if matrix is None else moved_views(views, matrix)

@@ -6,6 +6,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Literal
 
+from sgwarp.commands.inputs_kept import keep_maps, keep_photographs
 from sgwarp.commands.options import SemanticsOptions, check_folder, find_views, photograph, place_views
 from sgwarp.errors import InputError
 from sgwarp.runs.progress import show_progress
@@ -65,6 +66,7 @@ class Segment(SemanticsOptions):
             gaussians, semantics = self.load_both(log)
             predicted = self.load_predicted(gaussians, log)
             views = find_views(self.views, self.view, images=self.images)
+            self._keep_inputs(views)
             views = place_views(gaussians, self.scene, views, self.transform)
             encoder = None
             if classes is not None and semantics.labels is None:
@@ -89,6 +91,14 @@ class Segment(SemanticsOptions):
                     unknown += float((channel < 0).float().mean())
                     progress(done, len(views), view.stem)
             log.error["unknown"] = unknown / len(views)
+
+    def _keep_inputs(self, views: list[View]) -> None:
+        """No label image takes the place of a photograph, or of a label image that the semantics were lifted from."""
+        from sgwarp.io.store import read_notes
+
+        keep_maps("--out", self.out, read_notes(self.semantics).get("encoder"))
+        folders = (self.out, self.out / "overlays")
+        keep_photographs("--out", (folder / f"{view.stem}.png" for folder in folders for view in views), views)
 
     def _warn(self, classes: list[str], encoder: TextEncoder, log: RunLog) -> None:
         """Say which classes the encoder cannot tell, unless another scoring is asked for, which asks it anyway."""

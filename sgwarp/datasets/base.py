@@ -191,6 +191,11 @@ def read_class_names(path: Path) -> tuple[str, ...]:
             content = [content.get(str(number), f"class {number}") for number in range(1, last + 1)]
     if not isinstance(content, list) or not content or not all(isinstance(name, str) and name for name in content):
         raise InputError(f'{path}: expected a list of class names, or {{"1": "couch", "2": ...}} by id')
+    twice = next((name for name in content if content.count(name) > 1), None)
+    if twice is not None:
+        raise InputError(
+            f"{path}: '{twice}' is the name of two classes; give each a name of its own, or join their ids"
+        )
     return tuple(content)
 
 

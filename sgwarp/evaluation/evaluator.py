@@ -116,6 +116,7 @@ def evaluate_scene(
     scene = reader.open_scene(data, name)
     folder = out / "scenes" / name.replace("/", "__")
     identity = _identity(profile, scene, settings)
+    _keep_data(folder, scene)
     before = read_result(folder / FILE, identity)
     if before is not None:
         return before, True
@@ -137,6 +138,18 @@ def evaluate_scene(
     result.sheets = [f"scenes/{folder.name}/{sheet}" for sheet in result.sheets]
     write_result(folder / FILE, result, identity)
     return result, False
+
+
+def _keep_data(folder: Path, scene: SceneData) -> None:
+    """Refuse to put a record where the data lies: what is there before a record is written is removed.
+
+    Raises:
+        InputError: The scene's views or Gaussians lie in the folder of its record.
+    """
+    record = folder.resolve()
+    for path in (scene.folder, scene.gaussians):
+        if path is not None and path.resolve().is_relative_to(record):
+            raise InputError(f"{path}: lies in {folder}, where the record of this scene goes; choose another --out")
 
 
 def _remove(folder: Path, out: Path) -> None:
@@ -162,6 +175,9 @@ def choose_scenes(
         unknown = [name for name in wanted if name not in there]
         if unknown:
             raise InputError(f"{data}: has no scene '{unknown[0]}'; there are: {', '.join(there[:8])}")
+        twice = next((name for name in wanted if list(wanted).count(name) > 1), None)
+        if twice is not None:  # it would count twice in every mean
+            raise InputError(f"--scenes: '{twice}' stands there twice; leave one")
         return list(wanted), []
     listed = [name for name in profile.scenes if name in there]
     if profile.scenes and not listed:
@@ -181,4 +197,6 @@ def _identity(profile: Profile, scene: SceneData, settings: Settings) -> dict[st
         if path is not None and path.exists():
             status = path.stat()
             files[name] = [str(path), status.st_size, status.st_mtime_ns]
-    return {"profile": profile.name, "version": __version__, "settings": settings.identity, "files": files}
+    return {"profile": profile.name, "version": __version__, "settings": settings.identity, "files": files} | {
+        "classes": list(scene.classes)
+    }

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import asdict, dataclass
 from typing import Any, Literal
 
@@ -70,6 +71,10 @@ class Settings:
         for name, least in (("hold_out", 2), ("every", 1), ("count", 1), ("sheets", 0)):
             if getattr(self, name) < least:
                 raise InputError(f"{name}: expected {least} or more, got {getattr(self, name)}")
+        if not math.isfinite(self.threshold):
+            raise InputError(f"threshold: expected a finite number, got {self.threshold}")
+        if not 0 <= self.forgetting <= 1:
+            raise InputError(f"forgetting: expected 0 to 1, got {self.forgetting}")
         if bool(self.levels) != ("{level}" in self.encoder):
             raise InputError("levels: go together with {level} in the name of the encoder; give both or none")
 

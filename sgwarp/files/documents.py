@@ -26,10 +26,10 @@ def parse_json(where: str | os.PathLike[str], text: str | bytes, remedy: str = "
     """The content of a JSON document; `where` names it in messages.
 
     Raises:
-        InputError: It is not JSON, or nested deeper than DEEPEST.
+        InputError: It is not JSON, nested deeper than DEEPEST, or an entry stands twice in an object.
     """
     try:
-        content = json.loads(text)
+        content = json.loads(text, object_pairs_hook=_entries)
     except RecursionError:
         raise InputError(f"{where}: is nested deeper than {DEEPEST}; {remedy}") from None
     except (ValueError, MemoryError) as error:
@@ -41,6 +41,16 @@ def parse_json(where: str | os.PathLike[str], text: str | bytes, remedy: str = "
         if not level:
             return content
     raise InputError(f"{where}: is nested deeper than {DEEPEST}; {remedy}")
+
+
+def _entries(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
+    """An object. Readers of JSON differ in which of two entries of one name they take, so none is taken."""
+    found = dict(pairs)
+    if len(found) < len(pairs):
+        names = [name for name, _ in pairs]
+        twice = next(name for name in names if names.count(name) > 1)
+        raise ValueError(f"the entry '{twice[:40]}' stands twice in one object")
+    return found
 
 
 def _inside(outer: Any) -> Any:

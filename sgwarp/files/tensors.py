@@ -13,7 +13,7 @@ import torch
 from torch import Tensor
 
 from sgwarp.errors import InputError
-from sgwarp.files.access import reading
+from sgwarp.files.access import open_input, reading
 from sgwarp.files.atomic import atomic_path
 
 ALIGNMENT = 8  # bytes; the format asks for it
@@ -48,6 +48,8 @@ def read_tensors(
     except ImportError:
         raise InputError(f'{path}: reading it needs safetensors: pip install "sgwarp[cli]"') from None
     try:
+        with open_input(path):  # says what is wrong with a folder or a missing file; safe_open does not
+            pass
         with reading(path), safe_open(os.fspath(path), framework="pt") as content:
             kept = [name for name in content.keys() if names is None or name in names]  # noqa: SIM118
             return dict(content.metadata() or {}), {name: content.get_tensor(name) for name in kept}

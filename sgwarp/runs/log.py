@@ -15,6 +15,7 @@ from sgwarp.files.atomic import atomic_path
 from sgwarp.runs.progress import ShowProgress, hide_progress
 from sgwarp.version import __version__
 
+MOST_NAMED = 4  # files of one folder that are named one by one
 Watch = Callable[[Callable[[], Any]], None]
 
 
@@ -95,6 +96,16 @@ class RunLog:
         errors = ", ".join(f"{name} {value:.4f}" for name, value in self.error.items())
         left = ", ".join(f"{amount:g} {what.replace('_', ' ')}" for what, amount in self.left_out.items())
         return "; ".join(part for part in (times, errors, f"left out: {left}" if left else "") if part)
+
+    def where(self) -> str:
+        """One line: the files written, or of a folder that has many their number; empty if there are none."""
+        by_folder: dict[Path, list[str]] = {}
+        for path in self.outputs:
+            by_folder.setdefault(Path(path).parent, []).append(path)
+        parts = []
+        for folder, paths in by_folder.items():
+            parts += paths if len(paths) <= MOST_NAMED else [f"{len(paths)} files in {folder}"]
+        return f"wrote {', '.join(parts)}" if parts else ""
 
 
 def _finite(numbers: dict[str, float]) -> dict[str, float | None]:

@@ -71,6 +71,7 @@ def test_commands_run_on_scenes(scans, tmp_path, capsys, stage_files):
     [
         (("--do", "lift,dance"), "no 'dance'"),
         (("--do", "lift,lift"), "twice"),
+        (("--do", "lift", "--options", "lift.mode=center", "lift.mode=squared"), "'lift.mode' stands there twice"),
         (("--do", "segment,lift"), "in the order"),
         (("--do", ""), "name what to do"),
         (("--do", "lift", "--options", "lift.color=7"), "lift.color"),

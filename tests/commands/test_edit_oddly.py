@@ -1,5 +1,6 @@
 """Odd and hostile uses of `sgwarp edit` and `sgwarp instances`: one line, exit code 2, and nothing written."""
 
+import shutil
 from dataclasses import replace
 
 import cv2
@@ -7,7 +8,9 @@ import numpy as np
 import pytest
 import torch
 
+from sgwarp.apps.editing.selection import Selection
 from sgwarp.cli import main
+from sgwarp.errors import InputError
 from sgwarp.io.scenes import load_gaussians, save_gaussians
 from sgwarp.io.store import save_semantics
 from sgwarp.lifting.lifter import lift
@@ -52,9 +55,18 @@ def files(stage, stage_files, tmp_path_factory):
         ("--select id:1 --remove --encoder conse", "needs --semantics"),
         ("--select lamp --remove --semantics FOLDER/i.safetensors", "holds no lifted semantics"),
         ("--script FOLDER", "is a folder"),
+        ("--script FOLDER/edited.ops.json --keep id:2", "--keep: goes with --select"),
+        ("--script FOLDER/edited.ops.json --negatives wall", "--negatives: goes with --select"),
+        ("--script FOLDER/edited.ops.json --threshold 0.1", "--threshold: goes with --select"),
+        ("--script FOLDER/edited.ops.json --grow 1", "--grow: goes with --select"),
+        ("--script FOLDER/edited.ops.json --no-clean", "--no-clean: goes with --select"),
+        ("--select id:1 --remove --semantics FOLDER", "is a folder; give the name of a file"),
+        ("--select click:0000,5 --remove --views VIEWS", "write click:VIEW,x,y"),
         ("--script FOLDER/edited.ops.json --undo 1", "has 1 steps; leave at least one"),
         ("--script FOLDER/edited.ops.json --undo -1", "has 1 steps; leave at least one"),
         ("--select id:1 --remove --undo 1", "needs --script"),
+        ("--select id:1 --remove --select id:2", "--select: is given 2 times; write all values after one --select"),
+        ("--select id:1 --keep=id:2 --remove --keep id:3", "--keep: is given 2 times"),
     ],
 )
 def test_odd_edits(stage_files, files, tmp_path, capsys, options, message):
@@ -65,6 +77,53 @@ def test_odd_edits(stage_files, files, tmp_path, capsys, options, message):
     (line,) = capsys.readouterr().err.strip().splitlines()
     assert message in line
     assert not list(tmp_path.iterdir())
+
+
+@pytest.mark.parametrize(
+    "steps",
+    [
+        '[{"select": ["id:1"], "do": "remove"}], "steps": [{"select": ["id:2"], "do": "remove"}]',
+        '[{"select": ["id:1"], "select": ["id:2"], "do": "remove"}]',
+    ],
+)
+def test_a_script_that_says_two_things_is_refused(stage_files, files, tmp_path, capsys, steps):
+    script, out = tmp_path / "script.json", tmp_path / "o.ply"
+    fingerprint = stage_files.gaussians.fingerprint
+    script.write_text(f'{{"format": "sgwarp-edit", "version": 1, "scene": "{fingerprint}", "steps": {steps}}}')
+    instances = ["--instances", files / "i.safetensors"]
+    assert runs("edit", stage_files.scene, *instances, "--script", script, "--out", out) == 2
+    assert "stands twice" in capsys.readouterr().err
+    assert not out.exists()
+
+
+@pytest.mark.parametrize("term", ["all", "rows:0-4128"])
+def test_everything_is_everything(stage_files, tmp_path, term):
+    """Scattered pieces too: the panels lie apart, and the smallest has a 25th of the largest one's Gaussians."""
+    before = stage_files.gaussians.means
+    assert len(before) == 4129
+    assert not runs("edit", stage_files.scene, "--out", tmp_path / "o.ply", "--select", term, "--move", 0, 0, 2)
+    torch.testing.assert_close(load_gaussians(tmp_path / "o.ply").means, before + torch.tensor([0.0, 0.0, 2.0]))
+
+
+def test_a_click_into_a_view_whose_name_holds_commas(stage_files, files, tmp_path):
+    """The same click at the same photograph under another name."""
+    views = tmp_path / "views"
+    shutil.copytree(stage_files.views, views)
+    (views / "images" / "0000.png").rename(views / "images" / "küche, 7,5.png")
+    text = (views / "transforms.json").read_text()
+    (views / "transforms.json").write_text(text.replace("0000.png", "küche, 7,5.png"))
+    edit = ["edit", stage_files.scene, "--instances", files / "i.safetensors", "--remove"]
+    assert not runs(*edit, "--out", tmp_path / "a.ply", "--views", stage_files.views, "--select", "click:0000,40,40")
+    named = ["--views", views, "--select", "click:küche, 7,5,40,40"]
+    assert not runs(*edit, "--out", tmp_path / "b.ply", *named)
+    assert (tmp_path / "b.ply").read_bytes() == (tmp_path / "a.ply").read_bytes()
+
+
+@pytest.mark.parametrize("field", ["select", "keep", "negatives"])
+def test_a_text_is_no_list_of_terms(field):
+    """Taken letter by letter it would ask for nine things."""
+    with pytest.raises(InputError, match=f"{field}: expected a list of terms"):
+        Selection(**{"select": ("all",), field: "armchairs"})
 
 
 def test_undo_leaves_out_the_last_steps(stage_files, tmp_path):

@@ -7,6 +7,8 @@ from types import SimpleNamespace
 import pytest
 
 from sgwarp.cli import main
+from sgwarp.datasets.synthetic import make_room
+from sgwarp.datasets.synthetic_files import save_room
 from sgwarp.evaluation.networks import NetworkSettings
 from sgwarp.evaluation.profiles.catalogue import find_profile
 from sgwarp.evaluation.settings import Settings
@@ -98,3 +100,31 @@ def test_an_ablation_lifts_anew(words, capsys):
         patch.setattr(EVALUATE, lambda *rest, **options: pytest.fail("evaluated before it was refused"))
         assert main([*map(str, words), "--ablate", "modes", "--semantics", "s"]) == 2
     assert "--ablate: lifts anew each time; leave --semantics out" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(
+    ("more", "message"),
+    [
+        (["--threshold", "nan"], "--threshold: expected a finite number"),
+        (["--threshold", "inf"], "--threshold: expected a finite number"),
+        (["--forgetting", "5"], "--forgetting: expected 0 to 1"),
+        (["--forgetting", "nan"], "--forgetting: expected 0 to 1"),
+        (["--epochs", "0", "--ablate", "inputs"], "--epochs: expected 1 or more"),
+        (["--train", "others"], "--train others: goes with --ablate inputs"),
+        (["--train", "others", "--ablate", "views"], "--train others: goes with --ablate inputs"),
+    ],
+)
+def test_values_without_sense_are_refused_before_the_work(words, monkeypatch, capsys, more, message):
+    monkeypatch.setattr(EVALUATE, lambda *rest, **options: pytest.fail("evaluated before it was refused"))
+    assert main([*map(str, words), *more]) == 2
+    assert message in capsys.readouterr().err
+
+
+def test_a_scene_named_twice_is_refused(tmp_path, capsys):
+    """It would count twice in every mean."""
+    for name in ("attic", "study"):
+        save_room(make_room(seed=0, count=100), tmp_path / "rooms" / name, views=3, width=16, height=12)
+    words = ["evaluate", "room", "--data", tmp_path / "rooms", "--out", tmp_path / "out", "--encoder", "truth"]
+    assert main([*map(str, words), "--scenes", "study", "attic", "study"]) == 2
+    assert "--scenes: 'study' stands there twice" in capsys.readouterr().err
+    assert not (tmp_path / "out").exists()

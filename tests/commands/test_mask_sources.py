@@ -8,6 +8,7 @@ import pytest
 
 from sgwarp.cli import main
 from sgwarp.io.instances import load_instances
+from sgwarp.io.scenes import load_gaussians
 
 
 def find(stage_files, folder, masks: str, *options: str):
@@ -69,3 +70,36 @@ def test_stacks_of_masks_at_levels_give_a_tree(stage, stage_files, tmp_path, lev
         small_wall, small_door, small_lamp, _ = of_panel(stage, found, "s")
         assert 0 == small_wall != small_door != small_lamp != 0
         assert [rows[number - 1]["parent"] for number in (small_door, small_lamp)] == [door, door]
+
+
+def test_three_levels_of_nested_masks_give_the_tree_and_its_parts_can_be_edited(stage, stage_files, tmp_path):
+    """Door and lamp are parts of a group, group and book of a whole; the wall is a whole without parts."""
+    folder = tmp_path / "masks"
+    folder.mkdir()
+    for number, view in enumerate(stage.views):
+        wall, door, lamp, book = (stage.labels(view).numpy() == panel for panel in range(1, 5))
+        masks = np.stack([door, lamp, door | lamp, book, door | lamp | book, wall])
+        order = np.random.default_rng(number).permutation(6)
+        np.savez(folder / f"{view.stem}.npz", masks=masks[order], ranks=np.array([0, 0, 1, 1, 2, 2])[order])
+    found, rows = find(stage_files, tmp_path, f"masks:{folder}", "--levels", "s,m,l")
+    parents = {row["id"]: row["parent"] for row in rows}
+    _, door, lamp, _ = of_panel(stage, found, "s")
+    _, group, same, book = of_panel(stage, found, "m")
+    wall, *wholes = of_panel(stage, found, "l")
+    (whole,) = set(wholes)
+    assert group == same
+    assert len({wall, whole, group, book, door, lamp}) == 6
+    assert parents == {door: group, lamp: group, group: whole, book: whole, whole: 0, wall: 0}
+    assert {row["id"]: row["level"] for row in rows} == {
+        **{door: "s", lamp: "s"},
+        **{group: "m", book: "m"},
+        **{whole: "l", wall: "l"},
+    }
+    for chosen, panels in ((door, {2}), (group, {2, 3}), (whole, {2, 3, 4})):
+        out = tmp_path / "edited.ply"
+        words = ["edit", stage_files.scene, "--instances", tmp_path / "found" / "i.safetensors", "--out", out]
+        assert main([str(word) for word in (*words, "--select", f"id:{chosen}", "--extract")]) == 0
+        centers = {tuple(center) for center in load_gaussians(out).means.tolist()}
+        taken = np.array([tuple(center) in centers for center in stage_files.gaussians.means.tolist()])
+        shares = [taken[(stage.classes == panel).numpy()].mean() for panel in range(1, 5)]
+        assert all((share > 0.9) if number in panels else (share < 0.05) for number, share in enumerate(shares, 1))

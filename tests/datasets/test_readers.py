@@ -162,6 +162,10 @@ def test_labelled_folder(writer):
         assert np.array_equal(scene.load_labels("a").numpy(), labels.astype(int) - 1)
         view = scene.load_views()[0]
         assert float(scene.load_depth(view)[0, 0]) == pytest.approx(1.5)
+    for names in (["cup", "plate", "cup"], {"1": "cup", "2": "cup"}):
+        writer.text("kitchen/classes.json", names)
+        with pytest.raises(InputError, match=r"classes\.json: 'cup' is the name of two classes"):
+            labelled_folder.open_scene(writer.folder, "kitchen")
     writer.text("kitchen/classes.json", ["cup"])
     with pytest.raises(InputError, match=r"id 2, but classes\.json names 1"):
         labelled_folder.open_scene(writer.folder, "kitchen").load_labels("a")

@@ -1,5 +1,6 @@
 """Killed at random, an evaluation goes on without repeating or losing a scene."""
 
+import json
 import os
 import random
 import signal
@@ -8,7 +9,10 @@ import warnings
 from dataclasses import replace
 from pathlib import Path
 
+from sgwarp.cli import main
 from sgwarp.datasets.base import SceneData
+from sgwarp.datasets.synthetic import make_room
+from sgwarp.datasets.synthetic_files import save_room
 from sgwarp.evaluation.evaluator import evaluate
 from sgwarp.evaluation.profiles import room
 from sgwarp.evaluation.results import FILE
@@ -94,3 +98,21 @@ def test_no_scene_is_lost_or_repeated(tmp_path, monkeypatch):
     assert len(starts) - SCENES <= KILLS
     assert not list(out.glob("scenes/*/half.png"))
     assert not list(out.glob("scenes/*/.*"))
+
+
+def test_new_names_of_classes_make_a_record_anew(tmp_path, monkeypatch):
+    """The record has the names, and the same images under other names are another question."""
+    save_room(make_room(seed=3, count=300), tmp_path / "rooms" / "one", views=9, width=32, height=24)
+    names = tmp_path / "rooms" / "one" / "classes.json"
+
+    def run() -> tuple[int, list[str]]:
+        words = ["evaluate", "room", "--data", tmp_path / "rooms", "--out", tmp_path / "out", "--encoder", "truth"]
+        assert main([str(word) for word in words]) == 0
+        again = json.loads((tmp_path / "out" / "run.json").read_text())["left_out"].get("scenes_done_before", 0)
+        return again, json.loads((tmp_path / "out/scenes/one/result.json").read_text())["result"]["classes"]
+
+    before = run()[1]
+    assert run() == (1, before)
+    content = json.loads(names.read_text())
+    names.write_text(json.dumps({number: f"new {name}" for number, name in content.items()}))
+    assert run() == (0, [f"new {name}" for name in before])

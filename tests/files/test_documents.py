@@ -22,7 +22,20 @@ def test_deep_documents_are_refused(depth, pair):
     parse_json("x.json", opening * 64 + inner + closing * 64)
 
 
-@pytest.mark.parametrize("text", [b"", b"{", b"\xff\xfe", b"nul", b'{"a": 1,}', b"9" * 5000, b"\0", b"[" * 100_000])
+@pytest.mark.parametrize(
+    "text",
+    [
+        b"",
+        b"{",
+        b"\xff\xfe",
+        b"nul",
+        b'{"a": 1,}',
+        b"9" * 5000,
+        b"\0",
+        b"[" * 100_000,
+        b'{"a": 1, "b": {"a": 1, "a": 1}}',
+    ],
+)
 def test_other_texts_are_refused_in_one_line(text):
     with pytest.raises(InputError, match=r"^x\.json: ") as caught:
         parse_json("x.json", text)

@@ -16,6 +16,13 @@ from sgwarp.version import __version__
 KEYS = ["command", "version", "device", "threads", "stages", "left_out", "error", "outputs"]
 
 
+def test_where_the_results_lie():
+    log = RunLog()
+    assert log.where() == ""
+    log.outputs += ["out/scene.ply", "out/scene.ops.json", *(f"out/maps/{number:04d}.png" for number in range(60))]
+    assert log.where() == "wrote out/scene.ply, out/scene.ops.json, 60 files in out/maps"
+
+
 def test_the_file_holds_exactly_the_agreed_keys(tmp_path, monkeypatch):
     clock = [100.0]
     monkeypatch.setattr(time, "perf_counter", lambda: clock[0])

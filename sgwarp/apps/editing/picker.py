@@ -21,6 +21,7 @@ from sgwarp.scene import Camera, Gaussians, InstanceMap, Semantics, View
 NEIGHBORS = 8  # of a Gaussian when pieces are told apart
 LINK = 4.0  # neighbors farther apart than this many median distances belong to different pieces
 LEAST_PIECE = 0.1  # share of the largest piece that another one must have to stay
+GUESSED = ("text", "id", "box", "click")  # terms that may take in scattered pieces; others name each Gaussian
 HALF = 0.5  # of the threshold: what scores more belongs to a selection that it is connected with
 SAME = 0.8  # share of the best instance's score that another instance must have to be named by the same text
 CLICK_DEPTH = 8  # Gaussians of a pixel that a click asks
@@ -102,7 +103,7 @@ def _pick_clean(state: EditState, term: Term, selection: Selection, context: Edi
     else:
         chosen = _pick_term(state, term, context)
     chosen = chosen & free
-    if selection.clean and bool(chosen.any()):
+    if selection.clean and term.kind in GUESSED and bool(chosen.any()):
         chosen = largest_pieces(means, chosen)
     return chosen if around is None else spread(means, chosen, around & free)
 

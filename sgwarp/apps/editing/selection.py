@@ -7,7 +7,7 @@ A selection is a list of terms, each a short text:
 | lamp, or text:lamp | what the text names; whole instances where they are known |
 | id:3 | an instance |
 | box:x0,y0,z0,x1,y1,z1 | centers inside a box [m] |
-| click:STEM,x,y | the instance, or what looks alike around it, at a pixel of a view |
+| click:VIEW,x,y | the instance, or what looks alike around it, at a pixel of a view |
 | rows:0-4,9 | Gaussians by their place in the scene as it is at that step, ends included |
 | copy:1 | what the first duplication added |
 | last | what the step before was applied to, or the copy it made |
@@ -48,7 +48,7 @@ class Selection:
         threshold: Least score of a text, where 0 is the scene's median and 1 its best thousandth. What scores more than
             half of it and is connected with such Gaussians belongs to them.
         grow: Add what lies within this distance, or if negative take away what lies within it of the rest [m].
-        clean: Leave out scattered pieces of each term that hold less than a tenth of its largest one.
+        clean: Leave out scattered pieces of each text, id, box and click that hold less than a tenth of the largest.
 
     Raises:
         InputError: A term is malformed, or a number not finite.
@@ -64,6 +64,9 @@ class Selection:
     def __post_init__(self) -> None:
         if not self.select:
             raise InputError("select: give at least one term, such as a text, id:3 or box:x0,y0,z0,x1,y1,z1")
+        for name in ("select", "keep", "negatives"):
+            if isinstance(getattr(self, name), str):
+                raise InputError(f"{name}: expected a list of terms, got the text '{getattr(self, name)[:40]}'")
         for term in (*self.select, *self.keep):
             parse_term(term)
         if not all(isinstance(text, str) and text.strip() for text in self.negatives):
@@ -111,8 +114,8 @@ def parse_term(term: str) -> Term:
         if any(low > high for low, high in zip(corners[:3], corners[3:], strict=True)):
             raise InputError(f"select '{term}': the first corner must be the lower one in x, y and z")
         return Term(kind, numbers=corners)
-    stem, _, pixel = rest.partition(",")
-    return Term(kind, stem, _numbers(term, pixel, 2, "click:STEM,x,y"))
+    *names, x, y = rest.rsplit(",", 2) if rest.count(",") > 1 else ("", "", rest)  # a name may hold commas
+    return Term(kind, "".join(names), _numbers(term, f"{x},{y}", 2, "click:VIEW,x,y"))
 
 
 def rows_term(rows: Sequence[int]) -> str:
