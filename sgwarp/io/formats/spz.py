@@ -242,8 +242,8 @@ def write_spz(
 ) -> torch.Tensor:
     """Write a scene as SPZ, quantised.
 
-    Rows that are never rendered (NaN, infinity, a rotation of zero) are left out with a logged notice. Coordinates beyond +-2048 get fewer bits of
-    fraction than 12, with a logged notice.
+    Rows that are never rendered (NaN, infinity, a rotation of zero) are left out with a logged notice. Coordinates
+    beyond +-2048 get fewer bits of fraction than 12, with another.
 
     Args:
         version: 2 (rotations of 8 bits), 3 (smallest three) or 4 (Zstandard); 1 is read only.
