@@ -30,6 +30,7 @@ from sgwarp.reconstruction.fitting.photographs import (
     require_enough,
     require_overlap,
 )
+from sgwarp.reconstruction.fitting.pixels import PixelStore
 from sgwarp.reconstruction.fitting.settings import FitSettings
 from sgwarp.runs.interrupt import deferred_interrupt
 from sgwarp.runs.isolation import isolated
@@ -129,10 +130,16 @@ def fit(
     if checkpoint_every < 1:
         raise InputError(f"checkpoint_every: expected at least 1, got {checkpoint_every}")
     frame = Frame.around(views, start.means if isinstance(start, Gaussians) else None if start is None else start[0])
+    store = PixelStore(device)
     with log.stage("read"):
         photographs, shown = (
             read_photographs(
-                [*map(frame.view, group)], downscale=downscale, largest=largest, masks=given, device=device
+                [*map(frame.view, group)],
+                downscale=downscale,
+                largest=largest,
+                masks=given,
+                device=device,
+                store=store,
             )
             for group in (views, held_out)
         )
