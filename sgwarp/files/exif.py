@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import re
 import struct
 from typing import Any
 
@@ -36,6 +37,17 @@ def read_orientation(path: str | os.PathLike[str]) -> int:
     with reading(path), open(path, "rb") as file:
         head = file.read(HEAD_BYTES)
     return _of_tiff(_exif(head))
+
+
+def is_panorama(path: str | os.PathLike[str]) -> bool:
+    """Whether a photograph is noted to show all around, equirectangular (GPano's ProjectionType in its XMP data).
+
+    Raises:
+        InputError: The file is missing or not readable.
+    """
+    with reading(path), open(path, "rb") as file:
+        head = file.read(HEAD_BYTES)
+    return re.search(rb"ProjectionType\W{1,4}equirectangular", head) is not None
 
 
 def turn(pixels: NDArray[Any], orientation: int) -> NDArray[Any]:

@@ -14,7 +14,6 @@ decompress-ply.ts), read for the layout only.
 
 from __future__ import annotations
 
-import logging
 import os
 from typing import Any
 
@@ -23,14 +22,22 @@ import torch
 from numpy.typing import NDArray
 
 from sgwarp.errors import InputError
-from sgwarp.io.ply import REST_COUNTS, Elements, build_gaussians, columns, host_arrays, read_elements, write_elements
+from sgwarp.io.ply import (
+    REST_COUNTS,
+    Elements,
+    build_gaussians,
+    columns,
+    drawn_rows,
+    host_arrays,
+    read_elements,
+    write_elements,
+)
 from sgwarp.scene import Gaussians
 from sgwarp.version import __version__
 
 CHUNK = 256
 SH_C0 = 0.28209479177387814  # constant of degree 0: colour = SH_C0 f_dc + 0.5
 LOG_SCALE_LIMIT = 20.0  # the format's writers clamp here; exp(-20) is 2e-9
-MIN_NORM = 1e-3  # a shorter quaternion has no direction; the renderer leaves it out, too
 BITS_XYZ = (11, 10, 11)
 BITS_RGBA = (8, 8, 8, 8)
 BOUNDS = tuple(f"{end}_{axis}" for end in ("min", "max") for axis in "xyz")
@@ -105,16 +112,7 @@ def write_compressed_ply(gaussians: Gaussians, path: str | os.PathLike[str]) -> 
     """
     means, quats, scales, opacities, sh = host_arrays(gaussians)
     norms = np.linalg.norm(quats.astype(np.float64), axis=1)
-    kept = np.flatnonzero(gaussians.finite.cpu().numpy() & (norms >= MIN_NORM))
-    if len(kept) < len(gaussians):
-        logging.getLogger("sgwarp").warning(
-            "%s: left out %d of %d Gaussians with NaN, infinity or a rotation of zero",
-            path,
-            len(gaussians) - len(kept),
-            len(gaussians),
-        )
-    if len(kept) == 0:
-        raise InputError(f"{path}: not written, the scene has no Gaussians")
+    kept = drawn_rows(path, gaussians).numpy()
     order = kept[np.argsort(morton_codes(means[kept]), kind="stable")]
     with np.errstate(divide="ignore"):
         log_scales = np.log(scales[order]).clip(-LOG_SCALE_LIMIT, LOG_SCALE_LIMIT)

@@ -5,9 +5,11 @@ from __future__ import annotations
 import os
 import re
 from collections import Counter
+from fnmatch import fnmatch
 from pathlib import Path
 
 from sgwarp.files.access import reading
+from sgwarp.io.lens_models import PANORAMA_REMEDY
 
 # What tells a capture, relative to its folder: a pattern, what it is, and what makes a data set of it that is read.
 CAPTURES = (
@@ -45,6 +47,14 @@ LISTS = (
     ),
     ("*.csv", rb"\A#name", "RealityCapture's list of cameras (.csv)", "its COLMAP export, or ns-process-data"),
 )
+# The same of panoramas, which those tools cannot convert: the patterns of the lists above, and how each names the lens.
+PANORAMIC = (
+    ("reconstruction.json", rb'"projection_type"\s*:\s*"(spherical|equirectangular)"', "an OpenSfM reconstruction"),
+    ("sfm_data.json", rb'"polymorphic_name"\s*:\s*"spherical"', "an OpenMVG reconstruction"),
+    ("cameras.sfm", rb'"type"\s*:\s*"(equirectangular|spherical)"', "a Meshroom reconstruction"),
+    ("*.xml", rb"<sensor\b[^>]*\btype=[\"'](spherical|cylindrical)[\"']", "Metashape's list of cameras (.xml)"),
+)
+MOST_BYTES = 1 << 26  # of such a list that are looked at
 HEAD_BYTES = 4096
 # Endings of photographs that are not decoded, and what decodes them.
 UNREAD = {
@@ -62,6 +72,11 @@ def describe_capture(folder: Path) -> str | None:
     """What poses a folder holds that are not read, and the remedy; None if none of the known kinds."""
     if not folder.is_dir():
         return None
+    for pattern, content, what in PANORAMIC:
+        if any(path.is_file() and re.search(content, _head(path, MOST_BYTES)) for path in folder.glob(pattern)):
+            return (
+                f"holds {what} of panoramas, which are not read; {PANORAMA_REMEDY}, and find their poses (sgwarp poses)"
+            )
     for pattern, what, remedy in CAPTURES:
         if next(folder.glob(pattern), None) is not None:
             return _not_read(what, remedy)
@@ -77,9 +92,23 @@ def _not_read(what: str, remedy: str) -> str:
     return f"holds {what}, which is not read; convert it ({remedy}), or find poses anew (sgwarp poses)"
 
 
-def _head(path: Path) -> bytes:
+def describe_list(file: Path) -> str | None:
+    """The same of one file that was given by its name."""
+    for pattern, content, what in PANORAMIC:
+        if fnmatch(file.name, pattern) and re.search(content, _head(file, MOST_BYTES)):
+            return f"is {what} of panoramas, which are not read; {PANORAMA_REMEDY}, and find their poses (sgwarp poses)"
+    known = [(what, remedy) for pattern, what, remedy in CAPTURES if fnmatch(file.name, pattern)]
+    known += [
+        (what, remedy)
+        for pattern, content, what, remedy in LISTS
+        if fnmatch(file.name, pattern) and re.search(content, _head(file))
+    ]
+    return _not_read(*known[0]).replace("holds", "is", 1) if known else None
+
+
+def _head(path: Path, size: int = HEAD_BYTES) -> bytes:
     with reading(path), open(path, "rb") as file:
-        return file.read(HEAD_BYTES)
+        return file.read(size)
 
 
 def describe_unread(folder: Path) -> str | None:

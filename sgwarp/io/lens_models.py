@@ -25,6 +25,16 @@ LensModel = Literal[
 TINY = 1e-12
 PANORAMA = "EQUIRECTANGULAR"  # shows all around, which no pinhole image can
 PANORAMA_REMEDY = "cut the panoramas into perspective images first (pycolmap's example panorama_sfm.py does)"
+# As other tools call such lenses, in capitals.
+PANORAMAS = (
+    PANORAMA,
+    "SPHERICAL",
+    "PANORAMA",
+    "OMNIDIRECTIONALSTEREO_L",
+    "OMNIDIRECTIONALSTEREO_R",
+    "VR180_L",
+    "VR180_R",
+)
 # COLMAP's name: model here, number of focal lengths, number of coefficients.
 COLMAP_MODELS: dict[str, tuple[LensModel, int, int]] = {
     "SIMPLE_PINHOLE": ("perspective", 1, 0),

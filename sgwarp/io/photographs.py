@@ -7,8 +7,9 @@ from collections.abc import Iterable
 from pathlib import Path
 
 from sgwarp.errors import InputError
-from sgwarp.files.exif import NAMES, UPRIGHT, read_orientation
+from sgwarp.files.exif import NAMES, UPRIGHT, is_panorama, read_orientation
 from sgwarp.files.images import read_size
+from sgwarp.io.lens_models import PANORAMA_REMEDY
 from sgwarp.io.undistort import Lens
 
 LARGE = 200  # pixels, of which one more or less does not matter
@@ -63,6 +64,7 @@ def fit_photograph(lens: Lens, path: Path) -> tuple[Lens, int]:
         InputError: It does not have the shape of its camera, or cannot be read.
     """
     height, width = read_size(path)
+    refuse_panorama(path, height, width)
     orientation = read_orientation(path)
     ways = [(width, height, UPRIGHT)]
     if orientation >= 5:
@@ -83,6 +85,12 @@ def fit_photograph(lens: Lens, path: Path) -> tuple[Lens, int]:
         f"{path}: image is {width} x {height}{noted}, its camera says {lens.width} x {lens.height}, which is another "
         "shape; use the photographs that the cameras were found with, or resize one of them"
     )
+
+
+def refuse_panorama(path: Path, height: int, width: int) -> None:
+    """Raise InputError for a photograph that shows all around, whatever lens its camera is said to have."""
+    if width == 2 * height and is_panorama(path):
+        raise InputError(f"{path}: is a panorama (equirectangular); {PANORAMA_REMEDY}")
 
 
 def say_orientations(source: Path, used: Iterable[tuple[Path, int]]) -> None:

@@ -5,6 +5,7 @@ The only module that imports plyfile (GPLv3).
 
 from __future__ import annotations
 
+import io
 import logging
 import math
 import os
@@ -21,7 +22,7 @@ from sgwarp.files.access import reading
 from sgwarp.files.atomic import atomic_path
 from sgwarp.io.colors import rgb_names, unit_colors
 from sgwarp.io.formats.foreign import describe_ply
-from sgwarp.io.ply_header import check_ply
+from sgwarp.io.ply_header import check_ply, tidied
 from sgwarp.scene import SH_COUNTS, Gaussians
 
 Elements = Mapping[str, NDArray[Any]]  # element name -> structured array, one field per property
@@ -38,22 +39,35 @@ REST_COUNTS = tuple(3 * (k - 1) for k in SH_COUNTS)  # 0, 9, 24, 45
 # Below the logarithm of the smallest float32 (1.4e-45, -103.3): exp() and sigmoid() of it are exactly 0 again.
 LOG_ZERO = -110.0
 SAMPLED, COARSE = 16, 0.2  # every so many rows are looked at; steps of float32 that matter [size of a Gaussian]
+MIN_NORM = 1e-3  # a shorter quaternion has no direction; the renderer leaves it out, too
 ROWS_PER_BLOCK = 16384  # a block of 62 columns fits the cache, so that rows are fetched from memory once
 
 
 def read_elements(path: str | os.PathLike[str]) -> Elements:
     """Read any PLY file (ascii or binary, either byte order) into one structured array per element.
 
-    Binary elements without lists are memory-mapped, not loaded.
+    Binary elements without lists are memory-mapped, not loaded, unless comments or blank lines had to be left out.
 
     Raises:
         InputError: The file is missing, not a PLY file, or cut short.
     """
-    plyfile = _plyfile(path)
     check_ply(path)
     try:
+        return _parse(path, os.fspath(path))
+    except InputError:
+        # plyfile knows comments in ASCII alone, obj_info at the top alone, and no blank lines.
+        tidy = tidied(path)
+        if tidy is None:
+            raise
+    return _parse(path, io.BytesIO(tidy))
+
+
+def _parse(path: str | os.PathLike[str], source: str | io.BytesIO) -> Elements:
+    """The elements of a path, or of its content."""
+    plyfile = _plyfile(path)
+    try:
         with reading(path), np.errstate(over="ignore"):
-            content = plyfile.PlyData.read(os.fspath(path))
+            content = plyfile.PlyData.read(source)
     except plyfile.PlyElementParseError as error:
         element = error.element
         if "end-of-file" not in error.message:
@@ -108,6 +122,11 @@ def gaussians_from_elements(path: str | os.PathLike[str], elements: Elements) ->
     if len(vertex) == 0:
         raise InputError(f"{path}: has no Gaussians (element 'vertex' has 0 rows)")
     log = logging.getLogger("sgwarp")
+    if unsigned := [name for name in needed if name not in POSITION and vertex.dtype[name].kind == "u"]:
+        raise InputError(
+            f"{path}: its column {unsigned[0]} holds whole numbers from 0 up, expected logits of opacities, logarithms "
+            "of scales and quaternions; export it as the reference implementation does"
+        )
     values = columns(path, vertex, needed)
     means, logits, log_scales, quats = np.split(values, np.cumsum([3, 1, len(shape)]), axis=1)
     if bool((log_scales > 0).all()) and bool(((logits > 0) & (logits <= 1)).all()):
@@ -280,6 +299,27 @@ def _say_coarse(path: str | os.PathLike[str], means: NDArray[np.float32], scales
             "torn apart; move it near the origin where it was made",
             *(path, farthest, step, size),
         )
+
+
+def drawn_rows(path: str | os.PathLike[str], gaussians: Gaussians) -> torch.Tensor:
+    """Rows that are rendered at all, int64 [M]: neither NaN nor infinity, nor a rotation of zero.
+
+    Formats of bytes cannot hold such values: the others would become Gaussians that are seen. A logged notice says how
+    many are left out.
+
+    Raises:
+        InputError: There is none.
+    """
+    norms = torch.linalg.vector_norm(gaussians.quats.detach().double(), dim=1)
+    kept = (gaussians.finite & (norms >= MIN_NORM)).cpu().nonzero()[:, 0]
+    if len(kept) < len(gaussians):
+        logging.getLogger("sgwarp").warning(
+            "%s: left out %d of %d Gaussians with NaN, infinity or a rotation of zero",
+            *(path, len(gaussians) - len(kept), len(gaussians)),
+        )
+    if len(kept) == 0:
+        raise InputError(f"{path}: not written, the scene has no Gaussians")
+    return kept
 
 
 def host_arrays(gaussians: Gaussians) -> tuple[NDArray[np.float32], ...]:

@@ -42,7 +42,8 @@ def check_ply(path: str | os.PathLike[str]) -> None:
     at = head.find(END)
     if at < 0 and size > LONGEST:
         raise InputError(f"{path}: is not a valid PLY file (its header does not end within {LONGEST} bytes)")
-    newline = head.find(b"\n", at)
+    mark = b"\r" if _line_end(head) == b"\r" else b"\n"
+    newline = head.find(mark, at)
     if at < 0 or newline < 0:
         return
     end = newline + 1
@@ -61,6 +62,34 @@ def check_ply(path: str | os.PathLike[str]) -> None:
                 f"{fits} rows ({size} bytes in all); copy or download it again"
             )
         rest -= element.count * row
+
+
+def _line_end(head: bytes) -> bytes:
+    """What ends the lines of a header, as its first line says."""
+    return b"\r\n" if head[3:5] == b"\r\n" else head[3:4]
+
+
+def tidied(path: str | os.PathLike[str]) -> bytes | None:
+    """The file without what readers trip over: comments, which may hold any bytes, and blank lines.
+
+    Returns:
+        Its whole content, or None if there is nothing to leave out or its header does not end.
+    """
+    with open_input(path) as file:
+        data = file.read()
+    ending, at, lines = _line_end(data), 0, list[bytes]()
+    while lines[-1:] != [END]:
+        stop = data.find(ending, at) if ending in (b"\n", b"\r", b"\r\n") else -1
+        if not 0 <= stop < LONGEST:
+            return None
+        line, at = data[at:stop].strip(), stop + len(ending)
+        if line and line.split()[0] not in (b"comment", b"obj_info"):
+            lines.append(line)
+    body = data[at:]
+    if any(line.split()[:2] == [b"format", b"ascii"] for line in lines):
+        body = b"".join(row.strip() + b"\n" for row in body.splitlines() if row.strip())
+    tidy = b"\n".join(lines) + b"\n" + body
+    return None if tidy == data else tidy
 
 
 def _elements(header: bytes) -> tuple[bool, list[_Element]]:

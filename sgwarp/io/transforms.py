@@ -16,10 +16,10 @@ from sgwarp.errors import InputError
 from sgwarp.files.documents import read_json
 from sgwarp.files.exif import UPRIGHT, read_orientation
 from sgwarp.files.images import read_size
-from sgwarp.io.lens_models import COLMAP_MODELS, PANORAMA, PANORAMA_REMEDY, LensModel
+from sgwarp.io.lens_models import COLMAP_MODELS, PANORAMA_REMEDY, PANORAMAS, LensModel
 from sgwarp.io.names import find_named
 from sgwarp.io.photograph_files import PhotographFiles
-from sgwarp.io.photographs import LeftOut, fit_photograph, say_orientations
+from sgwarp.io.photographs import LeftOut, fit_photograph, refuse_panorama, say_orientations
 from sgwarp.io.stems import unique_stems
 from sgwarp.io.undistort import Lens, Listed, pinhole_view
 from sgwarp.scene import View
@@ -159,6 +159,7 @@ def _size_of(image: Path, frame: Fields, meta: Fields) -> tuple[tuple[int, int],
     One that lies sideways is turned if the principal point is nearer to the middle of the upright one.
     """
     height, width = read_size(image)
+    refuse_panorama(image, height, width)
     orientation = read_orientation(image)
     middle = [frame.get(key, meta.get(key)) for key in ("cx", "cy")]
     if orientation >= 5 and all(isinstance(value, (int, float)) for value in middle):
@@ -294,7 +295,7 @@ def _lens(where: str, frame: Fields, meta: Fields, size: tuple[int, int] | None)
     name = model.upper() if isinstance(model, str) else ""
     name = "OPENCV" if name == "PERSPECTIVE" else name  # as nerfstudio calls it in other places
     if name not in COLMAP_MODELS:
-        remedy = PANORAMA_REMEDY if name == PANORAMA else "undistort the photographs first"
+        remedy = PANORAMA_REMEDY if name in PANORAMAS else "undistort the photographs first"
         raise InputError(
             f"{where}: camera_model {model!r} is not supported; {remedy} (supported: {', '.join(COLMAP_MODELS)})"
         )

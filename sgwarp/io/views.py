@@ -7,7 +7,7 @@ from pathlib import Path
 
 from sgwarp.errors import InputError
 from sgwarp.io.colmap import find_model, read_colmap
-from sgwarp.io.foreign_captures import describe_capture, describe_unread
+from sgwarp.io.foreign_captures import describe_capture, describe_list, describe_unread
 from sgwarp.io.transforms import read_transforms
 from sgwarp.io.world import TRANSFORMS, moved_near_origin
 from sgwarp.scene import View
@@ -36,6 +36,8 @@ def load_views(path: str | os.PathLike[str], image_folder: str | None = None, ph
     files = [path] if os.path.isfile(path) else [path / name for name in TRANSFORMS]
     transforms = next((file for file in files if file.is_file()), None)
     if transforms is not None:
+        if known := describe_list(transforms):
+            raise InputError(f"{transforms}: {known}")
         if transforms.suffix.lower() != ".json":
             raise InputError(
                 f"{transforms}: is no data set of posed photographs; give its folder, or a transforms.json (archives "

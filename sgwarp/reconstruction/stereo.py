@@ -73,7 +73,10 @@ def estimate_depth(
         A map per photograph, at most 160 pixels wide and high.
     """
     report = progress or (lambda done, total, text: None)
-    small = [_shrink(image, camera) for image, camera in zip(images, cameras, strict=True)]
+    # Room for all copies first: each one between two large images would keep the memory of those from being reused.
+    small = [np.empty((*_small_size(camera), 3), np.float32) for camera in cameras]
+    for copy, image in zip(small, images, strict=True):
+        copy[:] = _shrink(image, copy.shape[:2])
     cameras = [camera.resized(*image.shape[:2]) for image, camera in zip(small, cameras, strict=True)]
     gray = [np.ascontiguousarray(image.mean(axis=2)) for image in small]
     neighbors = choose_neighbors(cameras, extent)
@@ -94,13 +97,18 @@ def estimate_depth(
     ]
 
 
-def _shrink(image: Array, camera: Camera) -> Array:
+def _small_size(camera: Camera) -> tuple[int, int]:
+    """(height, width) of the copy of a photograph."""
+    factor = min(1.0, LONGEST / max(camera.size))
+    height, width = (max(WINDOW, round(factor * size)) for size in camera.size)
+    return height, width
+
+
+def _shrink(image: Array, size: tuple[int, ...]) -> Array:
     """A small copy, float32 [h, w, 3]."""
     import cv2
 
-    factor = min(1.0, LONGEST / max(camera.size))
-    height, width = (max(WINDOW, round(factor * size)) for size in camera.size)
-    return np.asarray(cv2.resize(image, (width, height), interpolation=cv2.INTER_AREA), np.float32)
+    return np.asarray(cv2.resize(image, size[::-1], interpolation=cv2.INTER_AREA), np.float32)
 
 
 def choose_neighbors(cameras: Sequence[Camera], extent: float) -> list[list[int]]:

@@ -2,6 +2,7 @@
 
 import json
 import logging
+import re
 import shutil
 import struct
 
@@ -154,6 +155,72 @@ def test_captures_that_are_not_read_are_named(tmp_path, file, content, expected)
     (tmp_path / file).parent.mkdir(parents=True, exist_ok=True)
     (tmp_path / file).write_bytes(content)
     with pytest.raises(InputError, match=expected):
+        load_views(tmp_path)
+
+
+PANORAMAS = [
+    ("reconstruction.json", b'[{"cameras": {"v2": {"projection_type": "spherical", "width": 64}}}]', "OpenSfM"),
+    ("reconstruction.json", b'[{"cameras": {"c": {"projection_type":"equirectangular"}}}]', "OpenSfM"),
+    (
+        "sfm_data.json",
+        b'{"views": []' + b" " * 5000 + b',"intrinsics": [{"polymorphic_name": "spherical"}]}',
+        "OpenMVG",
+    ),
+    ("cameras.sfm", b'{"intrinsics": [{"intrinsicId": "1", "type": "equirectangular"}]}', "Meshroom"),
+    ("cams.xml", b'<document><chunk><sensors><sensor id="0" label="x" type="spherical">', "Metashape"),
+]
+
+
+@pytest.mark.parametrize(("file", "content", "tool"), PANORAMAS)
+def test_panoramas_of_other_tools_are_named(tmp_path, file, content, tool):
+    """Their export to COLMAP, the remedy for other photographs, has no such lens."""
+    photograph(tmp_path / "photos/a.png")
+    (tmp_path / file).write_bytes(content)
+    for given, verb in ((tmp_path, "holds"), (tmp_path / file, "is")):
+        with pytest.raises(
+            InputError, match=rf"{verb} .*{tool}.* of panoramas, .*; cut the panoramas into perspective"
+        ):
+            load_views(given)
+    flat = re.sub(rb"spherical|equirectangular", b"perspective", content)
+    (tmp_path / file).write_bytes(flat)
+    with pytest.raises(InputError, match=rf"{tool}.*which is not read; convert it"):
+        load_views(tmp_path)
+
+
+def test_lists_that_are_given_by_name_are_named(tmp_path):
+    (tmp_path / "cams.csv").write_bytes(b"#name,x,y,alt")
+    with pytest.raises(InputError, match=r"cams\.csv: is RealityCapture's list .*, which is not read; convert it"):
+        load_views(tmp_path / "cams.csv")
+
+
+XMP = b'http://ns.adobe.com/xap/1.0/\0<x:xmpmeta><rdf:Description GPano:ProjectionType="equirectangular"/></x:xmpmeta>'
+
+
+def panorama(path, size=(128, 64)):
+    """A JPEG with the XMP that panorama cameras write (Google's Photo Sphere metadata)."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    cv2.imwrite(str(path), np.full((size[1], size[0], 3), 90, np.uint8))
+    plain = path.read_bytes()
+    path.write_bytes(plain[:2] + b"\xff\xe1" + struct.pack(">H", len(XMP) + 2) + XMP + plain[2:])
+
+
+@pytest.mark.parametrize("sized", [False, True])
+def test_panoramas_behind_a_pinhole_are_left_out(tmp_path, sized):
+    panorama(tmp_path / "images/a.jpg")
+    panorama(tmp_path / "images/b.jpg", (128, 96))  # a part of one, cut out as a view
+    size = {"w": 128, "h": 64} if sized else {"w": None, "h": None}
+    transforms(tmp_path, ["images/a.jpg"], **size)
+    with pytest.raises(InputError, match=r"a\.jpg: is a panorama \(equirectangular\); cut the panoramas into"):
+        load_views(tmp_path)
+    transforms(tmp_path, ["images/b.jpg"], **(size | {"h": 96} if sized else size))
+    assert [view.stem for view in load_views(tmp_path)] == ["b"]
+
+
+@pytest.mark.parametrize("name", ["equirectangular", "SPHERICAL", "OMNIDIRECTIONALSTEREO_L", "VR180_R"])
+def test_every_name_of_a_panorama_has_its_remedy(tmp_path, name):
+    photograph(tmp_path / "a.png")
+    transforms(tmp_path, ["a.png"], camera_model=name)
+    with pytest.raises(InputError, match=f"'{name}' is not supported; cut the panoramas into perspective images"):
         load_views(tmp_path)
 
 

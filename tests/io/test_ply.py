@@ -494,3 +494,60 @@ def test_positions_that_float32_cannot_hold_are_said(tmp_path, ply_bytes, caplog
         row.update({f"scale_{axis}": -2.0 for axis in range(3)})
     load_gaussians(scene_file(ply_bytes, tmp_path / "a.ply", rows, kinds=["double"] * len(rows[0])))
     assert ("lies so far from the origin" in caplog.text) is said
+
+
+@pytest.mark.parametrize("form", ["binary_little_endian", "ascii"])
+@pytest.mark.parametrize("newline", ["\n", "\r\n", "\r"])
+@pytest.mark.parametrize(
+    ("before", "after"),
+    [
+        ("end_header", "comment made by J\xf6rg{0}end_header"),
+        ("end_header", "obj_info late{0}end_header"),
+        ("element", "{0}element"),
+        ("element", "comment end_header comes later{0}element"),
+    ],
+)
+def test_headers_as_other_tools_write_them(tmp_path, ply_bytes, before, after, newline, form):
+    rows = raw_rows(names_of(1))
+    path = scene_file(ply_bytes, tmp_path / "a.ply", rows, form=form, newline=newline)
+    path.write_bytes(path.read_bytes().replace(before.encode(), after.format(newline).encode("latin-1"), 1))
+    assert_scene(read_ply(path), rows, 1)
+
+
+@pytest.mark.parametrize("newline", ["\n", "\r\n"])
+def test_blank_lines_between_rows(tmp_path, ply_bytes, newline):
+    rows = raw_rows(names_of(0))
+    path = scene_file(ply_bytes, tmp_path / "a.ply", rows, form="ascii", newline=newline)
+    head, end, body = path.read_bytes().partition(b"end_header" + newline.encode())
+    blank = newline.encode() + b" \t" + newline.encode() * 2
+    path.write_bytes(head + end + blank + body.replace(newline.encode(), blank))
+    assert_scene(read_ply(path), rows, 0)
+
+
+def test_a_binary_header_that_ends_in_cr_is_not_cut_short(tmp_path, ply_bytes):
+    rows = [{name: 1.0 for name in CORE} for _ in range(5)]  # no byte of 1.0 is a newline
+    rows[4]["x"] = struct.unpack("<f", b"\n\n\n\n")[0]
+    assert_scene(read_ply(scene_file(ply_bytes, tmp_path / "a.ply", rows, newline="\r")), rows, 0)
+
+
+@pytest.mark.parametrize("name", ["opacity", "scale_1", "rot_0"])
+def test_bytes_are_no_logits(tmp_path, ply_bytes, name):
+    kinds = ["uchar" if column == name else "float" for column in CORE]
+    rows = [{column: 128 if column == name else 0.5 for column in CORE}]
+    path = scene_file(ply_bytes, tmp_path / "a.ply", rows, kinds=kinds)
+    with pytest.raises(InputError, match=rf"a\.ply: its column {name} holds whole numbers from 0 up, expected logits"):
+        read_ply(path)
+
+
+@pytest.mark.parametrize("ending", [".compressed.ply", ".spz", ".splat", ".glb"])
+def test_what_is_not_rendered_does_not_come_to_be_seen(tmp_path, ending, caplog):
+    scene = some_gaussians(6, 1)
+    scene.quats[0], scene.quats[1, 2], scene.opacities[2] = 0, math.nan, math.nan
+    scene.sh[3, 0, 1], scene.means[4, 0] = math.inf, -math.inf
+    save_gaussians(scene, tmp_path / f"a{ending}")
+    assert "left out 5 of 6 Gaussians with NaN, infinity or a rotation of zero" in caplog.text
+    after = load_gaussians(tmp_path / f"a{ending}")
+    assert after.means.tolist() == [pytest.approx(scene.means[5].tolist(), abs=1e-3)]
+    with pytest.raises(InputError, match="not written, the scene has no Gaussians"):
+        save_gaussians(scene.subset(torch.arange(5)), tmp_path / f"b{ending}")
+    assert not (tmp_path / f"b{ending}").exists()

@@ -19,7 +19,7 @@ from sgwarp.errors import InputError
 from sgwarp.files.access import read_bytes
 from sgwarp.files.atomic import atomic_path
 from sgwarp.io.formats.axes import PLY_AXES, change_axes
-from sgwarp.io.ply import build_gaussians, host_arrays
+from sgwarp.io.ply import build_gaussians, drawn_rows, host_arrays
 from sgwarp.scene import Gaussians
 
 ROW = np.dtype([("position", "<f4", 3), ("scales", "<f4", 3), ("rgba", "u1", 4), ("rotation", "u1", 4)])
@@ -54,21 +54,21 @@ def read_splat(path: str | os.PathLike[str], axes: str = PLY_AXES) -> Gaussians:
 def write_splat(gaussians: Gaussians, path: str | os.PathLike[str], axes: str = PLY_AXES) -> None:
     """Write a scene as .splat, in the order it has; only colors of degree 0 fit, which a logged notice says.
 
+    Rows that are never rendered (NaN, infinity, a rotation of zero) are left out with another.
+
     Raises:
         InputError: The scene is empty or the file cannot be written.
     """
-    if len(gaussians) == 0:
-        raise InputError(f"{path}: not written, the scene has no Gaussians")
+    gaussians = gaussians.subset(drawn_rows(path, gaussians))
     if gaussians.used_sh_degree:
         logging.getLogger("sgwarp").warning("%s: holds no view-dependent color; degree 1 and up are left out", path)
     means, quats, scales, opacities, sh = host_arrays(change_axes(gaussians, PLY_AXES, axes))
     rows = np.zeros(len(means), ROW)
     rows["position"], rows["scales"] = means, scales
     norms = np.linalg.norm(quats, axis=1, keepdims=True)
-    unit = quats / np.where(norms > 0, norms, 1)
+    unit = quats / norms
     rgba = np.concatenate([sh[:, 0] * SH_C0 + 0.5, opacities[:, None]], axis=1) * 255
-    with np.errstate(invalid="ignore"):
-        rows["rgba"] = np.nan_to_num(np.rint(rgba)).clip(0, 255)
-        rows["rotation"] = np.nan_to_num(np.rint(unit * 128 + 128), nan=128).clip(0, 255)
+    rows["rgba"] = np.rint(rgba).clip(0, 255)
+    rows["rotation"] = np.rint(unit * 128 + 128).clip(0, 255)
     with atomic_path(path) as temporary:
         temporary.write_bytes(rows.tobytes())

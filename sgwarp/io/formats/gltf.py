@@ -24,13 +24,14 @@ from sgwarp.files.atomic import atomic_path
 from sgwarp.io.formats.axes import GLTF_AXES, PLY_AXES, change_axes, move_gaussians
 from sgwarp.io.formats.gltf_buffers import Document, read_document
 from sgwarp.io.formats.spz import gaussians_from_spz
-from sgwarp.io.ply import build_gaussians, host_arrays
+from sgwarp.io.ply import build_gaussians, drawn_rows, host_arrays
 from sgwarp.scene import Gaussians, join_gaussians
 
 EXTENSION = "KHR_gaussian_splatting"
 SPZ_EXTENSIONS = ("KHR_gaussian_splatting_compression_spz_2", "KHR_gaussian_splatting_compression_spz")
 POINTS = 0  # mode of a primitive
 DISPLAY = "srgb_rec709_display"  # the color space of 3DGS scenes
+ELLIPSE = "ellipse"  # the kernel of 3DGS
 FLOAT = 5126
 GLB_MAGIC, GLB_JSON, GLB_BIN = 0x46546C67, 0x4E4F534A, 0x004E4942
 MAX_DEPTH = 64  # of nodes within nodes
@@ -47,19 +48,25 @@ def read_gltf(path: str | os.PathLike[str], axes: str = GLTF_AXES) -> Gaussians:
         InputError: The file is missing or damaged, or holds no Gaussians.
     """
     document = read_document(path)
-    parts = []
-    for primitive, matrix in _primitives(document):
-        if EXTENSION in _mapping(primitive.get("extensions")):
-            gaussians = _primitive(document, primitive)
-            try:
-                parts.append(move_gaussians(gaussians, matrix))
-            except InputError as error:
-                raise InputError(f"{path}: a node moves its Gaussians, but {error}") from None
+    parts = [
+        _moved(document, _primitive(document, primitive), matrix)
+        for primitive, matrix in _primitives(document)
+        if EXTENSION in _mapping(primitive.get("extensions"))
+    ]
     if not parts:
         raise InputError(
             f"{path}: holds no primitive with {EXTENSION}; it is a mesh or a point cloud, not a 3DGS scene"
         )
     return change_axes(join_gaussians(parts), axes, PLY_AXES)
+
+
+def _moved(document: Document, gaussians: Gaussians, matrix: NDArray[np.float64]) -> Gaussians:
+    try:
+        return move_gaussians(gaussians, matrix)
+    except InputError as error:
+        raise InputError(
+            f"{document.path}: one of its nodes moves the scene: {error}; apply it and export again"
+        ) from None
 
 
 def _mapping(value: Any) -> Mapping[str, Any]:
@@ -73,7 +80,7 @@ def _list(value: Any) -> list[Any]:
 def _primitives(document: Document) -> Iterator[tuple[Mapping[str, Any], NDArray[np.float64]]]:
     """Every primitive of the scene, and the matrix of its node."""
     nodes, scenes = document.rows("nodes"), document.rows("scenes")
-    chosen = document.meta.get("scene", 0)
+    chosen = document.meta.get("scene", 0)  # the one to show
     roots = document.row("scenes", chosen).get("nodes") if scenes else list(range(len(nodes)))
     waiting = [(root, np.eye(4), 0) for root in _list(roots)]
     seen: set[int] = set()
@@ -129,6 +136,9 @@ def _primitive(document: Document, primitive: Mapping[str, Any]) -> Gaussians:
     space = extension.get("colorSpace", DISPLAY)
     if space != DISPLAY:
         logging.getLogger("sgwarp").warning("%s: colors are in %s, taken for %s", document.path, space, DISPLAY)
+    kernel = extension.get("kernel", ELLIPSE)
+    if kernel != ELLIPSE:
+        logging.getLogger("sgwarp").warning("%s: its kernel is %s, taken for %s", document.path, kernel, ELLIPSE)
     inner = _mapping(extension.get("extensions"))
     for name in SPZ_EXTENSIONS:
         if name in inner:
@@ -168,19 +178,14 @@ def write_gltf(gaussians: Gaussians, path: str | os.PathLike[str], axes: str = G
     """Write a scene as binary glTF, float32, nothing lost but a quaternion's length.
 
     Raises:
-        InputError: The name ends in something else than .glb, the scene is empty or holds NaN or infinity only.
+        InputError: The name ends in something else than .glb, the scene is empty or holds nothing that is rendered.
     """
     if Path(path).suffix.lower() != ".glb":
         raise InputError(f"{path}: glTF scenes are written as .glb; change the name")
-    kept = gaussians.finite
-    if not bool(kept.all()):
-        logging.getLogger("sgwarp").warning("%s: left out %d Gaussians with NaN or infinity", path, int((~kept).sum()))
-        gaussians = gaussians.subset(kept)
-    if len(gaussians) == 0:
-        raise InputError(f"{path}: not written, the scene has no Gaussians")
+    gaussians = gaussians.subset(drawn_rows(path, gaussians))
     means, quats, scales, opacities, sh = host_arrays(change_axes(gaussians, PLY_AXES, axes))
     norms = np.linalg.norm(quats, axis=1, keepdims=True)
-    unit = np.where(norms > 0, quats / np.where(norms > 0, norms, 1), np.array([1, 0, 0, 0], np.float32))
+    unit = quats / norms
     columns = {
         "POSITION": means,
         f"{EXTENSION}:ROTATION": unit[:, [1, 2, 3, 0]],
@@ -214,7 +219,7 @@ def _description(columns: Mapping[str, NDArray[Any]], size: int) -> dict[str, An
         accessors.append(accessor)
         offset += 4 * count * width
     properties = {
-        "kernel": "ellipse",
+        "kernel": ELLIPSE,
         "colorSpace": DISPLAY,
         "projection": "perspective",
         "sortingMethod": "cameraDistance",

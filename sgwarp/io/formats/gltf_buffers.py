@@ -21,7 +21,9 @@ from sgwarp.files.documents import parse_json
 MAGIC, JSON, BIN = b"glTF", 0x4E4F534A, 0x004E4942
 COMPONENTS = {5120: "i1", 5121: "u1", 5122: "<i2", 5123: "<u2", 5125: "<u4", 5126: "<f4"}
 MOST_USES, ALLOWANCE = 4, 1 << 20  # of each byte; bytes beyond, for small files
-PACKED = ("EXT_meshopt_compression", "KHR_meshopt_compression", "KHR_draco_mesh_compression")
+# Extensions that pack the numbers of accessors; without them other numbers, or none, would be read.
+PACKINGS = ("EXT_meshopt_compression", "KHR_meshopt_compression", "MESHOPT_compression", "KHR_draco_mesh_compression")
+UNPACK = "export it without compression"
 WIDTHS = {"SCALAR": 1, "VEC2": 2, "VEC3": 3, "VEC4": 4}
 
 
@@ -128,9 +130,9 @@ def read_document(path: str | os.PathLike[str]) -> Document:
     if not isinstance(meta, dict) or not isinstance(meta.get("asset"), dict):
         raise InputError(f"{path}: is not a glTF file (no 'asset' in its JSON)")
     required = meta.get("extensionsRequired")
-    packed = [name for name in PACKED if isinstance(required, list) and name in required]
+    packed = [name for name in required if name in PACKINGS] if isinstance(required, list) else []
     if packed:
-        raise InputError(f"{path}: is packed with {packed[0]}, which is not read; export it without")
+        raise InputError(f"{path}: its data are packed ({packed[0]}), which is not read; {UNPACK}")
     buffers = []
     files: dict[str, memoryview] = {}  # each is read once, however often it is named
     listed = meta.get("buffers", [])

@@ -13,6 +13,7 @@ Source: the format's page at developer.playcanvas.com and playcanvas/splat-trans
 from __future__ import annotations
 
 import os
+import re
 import struct
 from collections.abc import Callable, Mapping
 from pathlib import Path
@@ -63,10 +64,22 @@ def read_sog(path: str | os.PathLike[str], axes: str = PLY_AXES) -> Gaussians:
         gaussians = _decode(path, read_bytes(path), fetch, sum(files.values()))
     else:
         with open_archive(path) as archive:
-            root = next((name[: -len(META)] for name in archive.members if name.endswith(META)), "")
+            root = _root(archive)
             read = lambda name: _member(archive, root + name)  # noqa: E731
             gaussians = _decode(path, read(META), read, archive.size)
     return change_axes(gaussians, axes, PLY_AXES)
+
+
+def _root(archive: Archive) -> str:
+    """What stands before the names of a scene's files: nothing, or the folder that was packed."""
+    inside = [re.split(r"[/\\]", name) for name in archive.members]
+    metas = [parts for parts in inside if parts[-1] == META and parts[0] != "__MACOSX"]
+    least = min(map(len, metas), default=0)
+    found = sorted({name[: -len(META)] for name in archive.members if re.split(r"[/\\]", name) in metas})
+    found = [root for root in found if len(re.split(r"[/\\]", root)) == least]
+    if len(found) > 1:
+        raise InputError(f"{archive.path}: holds {len(found)} scenes ({', '.join(found)[:80]}); unpack it and give one")
+    return found[0] if found else ""
 
 
 def _member(archive: Archive, name: str) -> bytes:

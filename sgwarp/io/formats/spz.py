@@ -34,7 +34,7 @@ from sgwarp.files.atomic import atomic_path
 from sgwarp.io.formats.axes import PLY_AXES, SPZ_AXES, change_axes
 from sgwarp.io.formats.packed import most_gaussians
 from sgwarp.io.formats.zstd import compress_zstd, decompress_zstd
-from sgwarp.io.ply import build_gaussians, host_arrays
+from sgwarp.io.ply import build_gaussians, drawn_rows, host_arrays
 from sgwarp.scene import SH_COUNTS, Gaussians
 
 MAGIC = 0x5053474E  # "NGSP"
@@ -128,7 +128,8 @@ def _read_streams(path: str | os.PathLike[str], data: bytes) -> tuple[Header, li
         raise InputError(f"{path}: is cut short: holds no SPZ header; copy or download it again")
     _, version, count, degree, bits, flags, streams, table = HEADER_4.unpack_from(data)
     if version != 4:
-        raise InputError(f"{path}: is an SPZ scene of version {version}; versions 1 to 4 are read")
+        fault = "is not packed with gzip; write it again" if version in VERSIONS else "versions 1 to 4 are read"
+        raise InputError(f"{path}: is an SPZ scene of version {version}; {fault}")
     header = _checked(path, Header(version, count, degree, bits, flags))
     sizes = [size for size in header.sizes if size]  # empty streams are not written
     position = table + streams * STREAM.size
@@ -241,8 +242,8 @@ def write_spz(
 ) -> torch.Tensor:
     """Write a scene as SPZ, quantised.
 
-    Rows that hold NaN or infinity are left out with a logged notice. Coordinates beyond +-2048 get fewer bits of
-    fraction than 12, with a logged notice.
+    Rows that are never rendered (NaN, infinity, a rotation of zero) are left out with a logged notice. Coordinates
+    beyond +-2048 get fewer bits of fraction than 12, with another.
 
     Args:
         version: 2 (rotations of 8 bits), 3 (smallest three) or 4 (Zstandard); 1 is read only.
@@ -256,13 +257,7 @@ def write_spz(
     """
     if version not in VERSIONS[1:]:
         raise InputError(f"{path}: SPZ is written in version 2, 3 or 4, not {version}")
-    kept = gaussians.finite.cpu().nonzero()[:, 0]
-    if len(kept) < len(gaussians):
-        logging.getLogger("sgwarp").warning(
-            "%s: left out %d Gaussians with NaN or infinity", path, len(gaussians) - len(kept)
-        )
-    if not len(kept):
-        raise InputError(f"{path}: not written, the scene has no Gaussians")
+    kept = drawn_rows(path, gaussians)
     header, arrays = _encode(path, change_axes(gaussians.subset(kept), PLY_AXES, axes), version)
     plain = [array.tobytes() for array in arrays]
     if version < 4:

@@ -35,30 +35,45 @@ class Photograph:
         stem: Name of the view.
         camera: At the size of the pixels.
         stored: Its pixels, uint8 [H, W, 3], or where they are kept.
-        mask: Which pixels count, bool [H, W], or None for all.
-        alpha: How opaque the pixels are, float32 [H, W] in [0, 1], or None where all are.
+        stored_mask: Which pixels count, uint8 [H, W], 0 for those that do not, kept likewise; None for all.
+        stored_alpha: How opaque the pixels are, uint8 [H, W], kept likewise; None where all are opaque.
         path: Its file.
     """
 
     stem: str
     camera: Camera
     stored: Tensor | StoredPixels
-    mask: Tensor | None = None
-    alpha: Tensor | None = None
+    stored_mask: Tensor | StoredPixels | None = None
+    stored_alpha: Tensor | StoredPixels | None = None
     path: Path | None = None
 
     @property
     def pixels(self) -> Tensor:
         """uint8 [H, W, 3]."""
-        return self.stored if isinstance(self.stored, Tensor) else self.stored.read()
+        return _read_stored(self.stored)
+
+    @property
+    def mask(self) -> Tensor | None:
+        """Which pixels count, bool [H, W], or None for all."""
+        return None if self.stored_mask is None else _read_stored(self.stored_mask).to(torch.bool)
+
+    @property
+    def alpha(self) -> Tensor | None:
+        """How opaque the pixels are, float32 [H, W] in [0, 1], or None where all are."""
+        return None if self.stored_alpha is None else _read_stored(self.stored_alpha).to(torch.float32) / 255.0
 
     def image(self, background: Tensor | None = None) -> Tensor:
         """float32 [H, W, 3] in [0, 1]; transparent pixels show the background, float32 [3], black if None."""
         image = self.pixels.to(torch.float32) / 255.0
-        if self.alpha is None:
+        alpha = self.alpha
+        if alpha is None:
             return image
-        image = image * self.alpha[..., None]
-        return image if background is None else image + (1.0 - self.alpha[..., None]) * background
+        image = image * alpha[..., None]
+        return image if background is None else image + (1.0 - alpha[..., None]) * background
+
+
+def _read_stored(stored: Tensor | StoredPixels) -> Tensor:
+    return stored if isinstance(stored, Tensor) else stored.read()
 
 
 def read_photographs(
@@ -80,7 +95,7 @@ def read_photographs(
         masks: Which pixels of a view count, [H, W] of its photograph, zero for those that do not; or None for all.
         device: Where the pixels go.
         progress: Called as `progress(done, total, name)`.
-        store: Takes the pixels; one for all photographs of a run bounds their memory together.
+        store: Where the pixels are kept; one of its own if None. Groups that are held together share one.
 
     Raises:
         InputError: A view has no photograph, or none of the photographs can be used.
@@ -174,10 +189,8 @@ def _read(view: View, size: tuple[int, int], masks: Masks | None, store: PixelSt
             alpha = cv2.resize(alpha, size[::-1], interpolation=cv2.INTER_AREA)
     if mask is not None and not mask.any():
         return None
-    known = None if mask is None else torch.from_numpy(mask).to(store.device)
-    opaque = None
-    if alpha is not None:
-        opaque = torch.from_numpy(np.ascontiguousarray(alpha)).to(store.device, torch.float32) / 255.0
+    known = None if mask is None else store.put(mask.astype(np.uint8))
+    opaque = None if alpha is None else store.put(np.asarray(alpha, np.uint8))
     return Photograph(view.stem, camera, store.put(pixels), known, opaque, Path(view.image_path))
 
 

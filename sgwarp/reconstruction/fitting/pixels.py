@@ -26,7 +26,7 @@ class PixelStore:
         self.file: Any = None
 
     def put(self, pixels: np.ndarray) -> StoredPixels | Tensor:
-        """Keep an image, uint8 [H, W, 3]."""
+        """Keep an image or what belongs to it, uint8 [H, W, 3] or [H, W]."""
         if pixels.nbytes <= self.left:
             self.left -= pixels.nbytes
             return torch.from_numpy(np.ascontiguousarray(pixels)).to(self.device)

@@ -131,10 +131,16 @@ def fit(
         raise InputError(f"checkpoint_every: expected at least 1, got {checkpoint_every}")
     frame = Frame.around(views, start.means if isinstance(start, Gaussians) else None if start is None else start[0])
     store = PixelStore(device)
-    sizes: dict[str, Any] = {"downscale": downscale, "largest": largest}
     with log.stage("read"):
         photographs, shown = (
-            read_photographs([*map(frame.view, group)], **sizes, masks=given, device=device, store=store)
+            read_photographs(
+                [*map(frame.view, group)],
+                downscale=downscale,
+                largest=largest,
+                masks=given,
+                device=device,
+                store=store,
+            )
             for group in (views, held_out)
         )
     require_enough(photographs)

@@ -19,6 +19,7 @@ from sgwarp.files.atomic import atomic_path
 from sgwarp.files.documents import read_json
 from sgwarp.files.images import read_size
 from sgwarp.io.foreign_captures import describe_unread
+from sgwarp.io.photographs import refuse_panorama
 from sgwarp.io.stems import IMAGE_ENDINGS, is_image_name
 from sgwarp.reconstruction.sfm.features import (
     SfmSettings,
@@ -164,9 +165,13 @@ def _why_unreadable(path: Path) -> str | None:
     if path.suffix.lower() in NOT_COLMAP:
         return f"needs another format: COLMAP reads no {path.suffix.lower()[1:]}, convert it to JPEG or PNG"
     try:
-        read_size(path)
+        height, width = read_size(path)
     except InputError:
         return "cannot be read"
+    try:
+        refuse_panorama(path, height, width)
+    except InputError as error:
+        return str(error).removeprefix(f"{path}: ")
     return None
 
 

@@ -169,30 +169,51 @@ def test_only_binary_is_written(tmp_path, scene):
     assert np.array_equal(list(tmp_path.iterdir()), [])
 
 
-def test_the_scene_that_the_file_chooses_is_read(tmp_path):
-    def second(meta):
-        meta["nodes"].append({"mesh": 0, "translation": [10, 0, 0]})
-        meta["scenes"].append({"nodes": [1]})
-        meta["scene"] = 1
-
-    scene = read_gltf(document(tmp_path, two_gaussians(), change=second), axes="rdf")
-    assert scene.means.tolist() == [[11, 2, 3], [14, 5, 6]]
-
-
-@pytest.mark.parametrize(
-    ("change", "message"),
-    [
-        (lambda m: m.update(extensionsRequired=["EXT_meshopt_compression"]), "packed with EXT_meshopt_.*without"),
-        (lambda m: m["nodes"][0].update(scale=[2, 1, 1]), r"a\.gltf: a node moves its Gaussians, but the transform"),
-        (lambda m: m.update(scene=5), r"refers to scenes\[5\]"),
-    ],
-)
-def test_what_a_file_may_ask_for_and_is_not_read(tmp_path, change, message):
-    with pytest.raises(InputError, match=message):
-        read_gltf(document(tmp_path, two_gaussians(), change=change))
-
-
 def test_a_draft_of_the_extension_is_named(tmp_path):
     attributes = {key.replace(f"{NAME}:", "_"): value for key, value in two_gaussians().items()}
     with pytest.raises(InputError, match=r"lacks the attribute .*:ROTATION; it follows a draft of the extension"):
         read_gltf(document(tmp_path, attributes))
+
+
+def test_the_scene_to_show_is_read(tmp_path):
+    def two_scenes(meta):
+        meta["nodes"] = [{"mesh": 0, "translation": [100, 0, 0]}, {"mesh": 0, "translation": [0, 10, 0]}]
+        meta.update(scenes=[{"nodes": [0]}, {"nodes": [1]}], scene=1)
+
+    scene = read_gltf(document(tmp_path, two_gaussians(), change=two_scenes), axes="RDF")
+    assert scene.means.tolist() == [[1, 12, 3], [4, 15, 6]]
+    path = document(tmp_path, two_gaussians(), change=lambda m: m.update(scene=7))
+    with pytest.raises(InputError, match=r"refers to scenes\[7\]"):
+        read_gltf(path)
+
+
+def test_meshes_beside_are_left_alone(tmp_path):
+    def mesh(meta):
+        meta["meshes"].insert(0, {"primitives": [{"attributes": {"POSITION": 0}, "mode": 4}]})
+        meta["meshes"][1]["primitives"].insert(0, {"attributes": {"POSITION": 0}})
+        meta["nodes"] = [{"mesh": 0, "children": [1]}, {"mesh": 1}]
+
+    scene = read_gltf(document(tmp_path, two_gaussians(), form="file", change=mesh), axes="RDF")
+    assert scene.means.tolist() == [[1, 2, 3], [4, 5, 6]]
+
+
+def test_packed_numbers_are_refused(tmp_path):
+    def meshopt(meta):
+        meta["extensionsRequired"] = ["KHR_mesh_quantization", "EXT_meshopt_compression"]
+        meta["buffers"].append({"byteLength": 9, "extensions": {"EXT_meshopt_compression": {"fallback": True}}})
+
+    with pytest.raises(
+        InputError, match=r"a\.gltf: its data are packed \(EXT_meshopt_compression\), which is not read"
+    ):
+        read_gltf(document(tmp_path, two_gaussians(), change=meshopt))
+
+
+def test_a_sheared_scene_names_its_file(tmp_path):
+    path = document(tmp_path, two_gaussians(), change=lambda m: m["nodes"][0].update(scale=[1, 2, 1]))
+    with pytest.raises(InputError, match=r"a\.gltf: one of its nodes moves the scene: the transform is not a rotation"):
+        read_gltf(path)
+
+
+def test_another_kernel_is_said(tmp_path, caplog):
+    read_gltf(document(tmp_path, two_gaussians(), extension={"kernel": "box", "colorSpace": "srgb_rec709_display"}))
+    assert "its kernel is box, taken for ellipse" in caplog.text

@@ -153,3 +153,29 @@ def test_size_by_the_header():
 def test_mutated_files(tmp_path, survives):
     made, meta = pictures(bands=1)
     survives(write(tmp_path / "a.sog", made, meta), read_sog, 100)
+
+
+def packed(path, root, made, meta, others=()):
+    with zipfile.ZipFile(path, "w") as archive:
+        for name, data in others:
+            archive.writestr(name, data)
+        archive.writestr(f"{root}meta.json", json.dumps(meta))
+        for name, rgba in made.items():
+            archive.writestr(f"{root}{name}.webp", webp(rgba))
+    return path
+
+
+@pytest.mark.parametrize("other", ["__MACOSX/scene/._meta.json", "lod-meta.json", "scene/old/meta.json"])
+def test_a_packed_folder_with_other_files(tmp_path, other):
+    made, meta = pictures()
+    plain = read_sog(write(tmp_path / "a.sog", made, meta))
+    for root in ("scene/", "scene\\"):
+        scene = read_sog(packed(tmp_path / "b.sog", root, made, meta, [(other, b"{}")]))
+        assert torch.equal(scene.means, plain.means)
+        assert torch.equal(scene.sh, plain.sh)
+
+
+def test_two_packed_scenes_are_named(tmp_path):
+    path = packed(tmp_path / "a.sog", "near/", *pictures(), others=[("far/meta.json", b"{}")])
+    with pytest.raises(InputError, match=r"a\.sog: holds 2 scenes \(far/, near/\); unpack it and give one"):
+        read_sog(path)

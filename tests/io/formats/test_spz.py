@@ -134,7 +134,7 @@ def test_far_coordinates_and_rows_that_are_not_finite(tmp_path, scene, caplog):
         assert write_spz(scene, tmp_path / "a.spz").tolist() == [0, 1, 3]
         after = read_spz(tmp_path / "a.spz")
     assert "coordinates reach 500000, so positions are kept to 0.0625" in caplog.text
-    assert "left out 1 Gaussians with NaN or infinity" in caplog.text
+    assert "left out 1 of 4 Gaussians with NaN, infinity or a rotation of zero" in caplog.text
     assert (after.means - means[[0, 1, 3]]).abs().max() <= 0.0625 / 2
 
 
@@ -187,3 +187,9 @@ def test_what_is_not_written(tmp_path, scene):
     with pytest.raises(InputError, match="not written, the scene has no Gaussians"):
         write_spz(empty, tmp_path / "a.spz")
     assert not list(tmp_path.iterdir())
+
+
+def test_a_raw_stream_is_named(tmp_path):
+    (tmp_path / "a.spz").write_bytes(struct.pack("<IIIBBBB", 0x5053474E, 2, 1, 0, 12, 0, 0) + bytes(64))
+    with pytest.raises(InputError, match="is an SPZ scene of version 2; is not packed with gzip"):
+        read_spz(tmp_path / "a.spz")

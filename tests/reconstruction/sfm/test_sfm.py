@@ -171,3 +171,18 @@ def test_photographs_become_a_scene_in_one_command(found, tmp_path, capsys):
     assert {"held_out_psnr", "fitted_psnr", "overfitting_gap", "reprojection_error"} <= set(log["error"])
     assert (tmp_path / "scene.ply.sfm/sparse/0/images.bin").is_file()
     assert "8 of 9 photographs have poses" in capsys.readouterr().err
+
+
+def test_panoramas_are_left_out_with_the_remedy(tmp_path):
+    """COLMAP would take them for what one lens sees."""
+    xmp = b"http://ns.adobe.com/xap/1.0/\0<GPano:ProjectionType>equirectangular</GPano:ProjectionType>"
+    for index in range(3):
+        path = tmp_path / f"in/{index}.jpg"
+        path.parent.mkdir(exist_ok=True)
+        cv2.imwrite(str(path), np.full((32, 64, 3), index, np.uint8))
+        plain = path.read_bytes()
+        path.write_bytes(plain[:2] + b"\xff\xe1" + (len(xmp) + 2).to_bytes(2, "big") + xmp + plain[2:])
+    with pytest.raises(
+        InputError, match=r"0\.jpg: is a panorama \(equirect.*; cut the panoramas into .* \(3 of 3 photog"
+    ):
+        estimate_poses(tmp_path / "in", tmp_path / "out")
