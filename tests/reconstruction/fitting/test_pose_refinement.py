@@ -150,7 +150,8 @@ def test_masked_pixels_have_no_say_in_a_held_out_pose(boards, finished):
     pixels, mask = photograph.pixels.clone(), torch.ones(view.camera.size, dtype=torch.bool)
     half = view.camera.width // 2
     pixels[:, :half], mask[:, :half] = pixels[:, :half].flip(0), False
-    (camera,) = refine_held_out_poses(finished, [replace(photograph, stored=pixels, mask=mask)], None, 0.2)
+    masked = replace(photograph, stored=pixels, stored_mask=mask.to(torch.uint8))
+    (camera,) = refine_held_out_poses(finished, [masked], None, 0.2)
     assert mean_error([replace(view, camera=camera)], [view], points) < 0.5 * mean_error([off], [view], points)
 
 

@@ -293,7 +293,7 @@ def test_transparent_photographs_show_the_background_of_the_step(boards, spied, 
 
     def transparent(views, **options):
         found = original(views, **options)
-        return [replace(p, alpha=torch.zeros(p.camera.size)) for p in found]
+        return [replace(p, stored_alpha=torch.zeros(p.camera.size, dtype=torch.uint8)) for p in found]
 
     monkeypatch.setattr(trainer, "read_photographs", transparent)
     short_fit(boards, replace(SHORT, steps=4, background="random"))
