@@ -8,10 +8,10 @@ copied, because the flat arrays shift.
 
 import warp as wp
 
-from sgwarp.kernels.gaussian import Splat
+from sgwarp.kernels.gaussian import EXACT_OPTIONS, Splat
 
 # Those of `shared.py`: the additions of both must round alike.
-wp.set_module_options({"enable_backward": False, "fast_math": False, "max_unroll": 1})
+wp.set_module_options({**EXACT_OPTIONS, "max_unroll": 1})
 
 
 # The loops over all places are plain C: through Warp's arrays, an element takes several times as long.

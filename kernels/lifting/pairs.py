@@ -2,7 +2,9 @@
 
 import warp as wp
 
-wp.set_module_options({"enable_backward": False, "fast_math": False, "max_unroll": 1})
+from sgwarp.kernels.gaussian import EXACT_OPTIONS
+
+wp.set_module_options({**EXACT_OPTIONS, "max_unroll": 1})
 
 
 @wp.kernel
