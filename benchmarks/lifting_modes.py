@@ -238,17 +238,16 @@ def plot(results: Row, path: Path) -> None:
     figure, panels = plt.subplots(1, 2, figsize=(11, 4.6), sharey=True)
     for panel, room in zip(panels, ("rendered", "generated"), strict=True):
         start = f"{room}, 100% of views, "
-        for key, row in results["sweep"].items():
-            if key.startswith(start):
-                _mark(panel, row, key.removeprefix(start), "o")
-        _mark(panel, results["rivals"][f"{room}, nearest points"], "nearest points", "s")
+        rows = {key.removeprefix(start): row for key, row in results["sweep"].items() if key.startswith(start)}
+        _mark(panel, rows | {"nearest points": results["rivals"][f"{room}, nearest points"]})
         for what, color in (("fitted", "tab:red"), ("fitted, 8 channels", "tab:orange")):
             keys = [f"{room}, {what}, {step} steps" for step in LOOK_AT]
-            rows = [results["rivals"][key] for key in keys if key in results["rivals"]]
-            panel.plot([r["seconds"] for r in rows], [r["mIoU"] for r in rows], "^-", color=color, label=what)
+            fits = [results["rivals"][key] for key in keys if key in results["rivals"]]
+            panel.plot([r["seconds"] for r in fits], [r["mIoU"] for r in fits], "^-", color=color, label=what)
         alone = results["rivals"][f"{room}, 2D alone"]["mIoU"]
         panel.axhline(alone, color="grey", linestyle=":", label="2D maps alone")
-        panel.set(title=f"{room} room", xscale="log", xlabel="seconds (without the maps)")
+        panel.set(title=f"{room} room", xscale="log", xlim=(0.02, 120), xlabel="seconds (without the maps)")
+        panel.set_ylim(-0.03, 0.75)
         panel.grid(alpha=0.3)
     panels[0].set_ylabel("mIoU on held-out views")
     panels[1].legend(loc="lower right")
@@ -256,11 +255,20 @@ def plot(results: Row, path: Path) -> None:
     figure.savefig(path, dpi=110)
 
 
-def _mark(panel: Any, row: Row, name: str, marker: str) -> None:
-    panel.plot(row["seconds"], row["mIoU"], marker, color="tab:blue" if marker == "o" else "tab:green")
-    below = name in ("center", "strongest", "reliable")  # points lie close to each other
-    place = (5, -11) if below else (5, 4)
-    panel.annotate(name, (row["seconds"], row["mIoU"]), textcoords="offset points", xytext=place, fontsize=8)
+def _mark(panel: Any, rows: Row) -> None:
+    """Points with names. Those of one walk over the views lie close together: their names stand in a column beside."""
+    close = sorted((name for name in rows if rows[name]["seconds"] < 0.8), key=lambda name: -rows[name]["mIoU"])
+    for name, row in rows.items():
+        rival = name == "nearest points"
+        panel.plot(row["seconds"], row["mIoU"], "s" if rival else "o", color="tab:green" if rival else "tab:blue")
+        if name not in close:
+            panel.annotate(name, (row["seconds"], row["mIoU"]), textcoords="offset points", xytext=(0, -13), fontsize=8)
+    for place, name in enumerate(close):
+        at = (rows[name]["seconds"], rows[name]["mIoU"])
+        line = {"arrowstyle": "-", "color": "0.7", "linewidth": 0.7}
+        panel.annotate(
+            name, at, xytext=(0.16, 0.7 - 0.04 * place), ha="right", va="center", fontsize=8, arrowprops=line
+        )
 
 
 def main() -> None:
