@@ -8,7 +8,7 @@ seen from z itself.
 import warp as wp
 
 from sgwarp.kernels.blocks import BLOCK, barrier, comes_last, latest_double, put, put_double
-from sgwarp.kernels.sparse.convolution_block import CHANNELS, LANES
+from sgwarp.kernels.sparse.products_block import CHANNELS, LANES
 from sgwarp.kernels.transmittance import BLOCK_OPTIONS
 
 wp.set_module_options(BLOCK_OPTIONS)

@@ -285,10 +285,11 @@ def _lens(where: str, frame: Fields, meta: Fields, size: tuple[int, int] | None)
         degrees = key.endswith("_fov")
         angle = math.radians(value) if degrees else value
         if not 0 < angle < math.pi:
-            unit, other = ("degrees between 0 and 180", "") if degrees else ("radians between 0 and pi", "")
-            if not degrees and math.pi < value < 180:
-                other = f"; if these are degrees, name it '{key[-1]}_fov'"
-            raise InputError(f"{where}: '{key}' must be a field of view in {unit}, got {value:g}{other}")
+            unit = "degrees between 0 and 180" if degrees else "radians between 0 and pi"
+            perhaps = (
+                f"; if these are degrees, name it '{key[-1]}_fov'" if not degrees and math.pi < value < 180 else ""
+            )
+            raise InputError(f"{where}: '{key}' must be a field of view in {unit}, got {value:g}{perhaps}")
         return 0.5 * extent / math.tan(0.5 * angle)
 
     model = frame.get("camera_model", meta.get("camera_model", "OPENCV"))

@@ -9,6 +9,7 @@ import warp as wp
 from torch import Tensor
 
 from sgwarp.kernels.sparse import convolution_block as kernels
+from sgwarp.kernels.sparse import products_block
 from sgwarp.ops.launcher import counters, launch_blocks, scratch, view
 from sgwarp.ops.sparse.voxels import KernelMap
 
@@ -54,7 +55,7 @@ def convolve(
     if not y.numel():
         return y, statistics
     table, mirrored = kernel_map.table(by_target=True)
-    grid = [parts_of(len(y), kernels.TARGETS), parts_of(outputs, kernels.CHANNELS)]
+    grid = [parts_of(len(y), products_block.TARGETS), parts_of(outputs, products_block.CHANNELS)]
     moments = scratch("sparse moments", 2 * grid[0] * outputs if running else 0, torch.float64, device)
     mean, variance, epsilon, momentum = running or (y.new_empty(0), y.new_empty(0), 0.0, 0.0)
     inputs = [view(rows_of(features), wp.float32), view(weight, wp.float32), view(table, wp.int32), int(mirrored)]
@@ -77,9 +78,9 @@ def gradients(
     device, (offsets, inputs, outputs) = features.device, weight.shape
     v_features = features.new_empty(kernel_map.source_count, inputs) if wanted[0] else None
     v_weight = weight.new_empty(weight.shape) if wanted[1] else None
-    across = parts_of(inputs, kernels.CHANNELS)
-    feature_blocks = 0 if v_features is None else parts_of(len(v_features), kernels.TARGETS) * across
-    pieces = 0 if v_weight is None else offsets * across * parts_of(outputs, kernels.CHANNELS)
+    across = parts_of(inputs, products_block.CHANNELS)
+    feature_blocks = 0 if v_features is None else parts_of(len(v_features), products_block.TARGETS) * across
+    pieces = 0 if v_weight is None else offsets * across * parts_of(outputs, products_block.CHANNELS)
     shares = max(1, min(BUSY_BLOCKS // max(pieces, 1), MAX_SHARES))
     blocks = feature_blocks + pieces * shares
     if not blocks:

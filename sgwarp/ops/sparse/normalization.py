@@ -16,7 +16,7 @@ import warp as wp
 from torch import Tensor
 from torch.autograd.function import once_differentiable
 
-from sgwarp.kernels.sparse import convolution_block, normalization_block
+from sgwarp.kernels.sparse import convolution_block, normalization_block, products_block
 from sgwarp.ops.launcher import counters, launch_blocks, launch_plain, scratch, view
 from sgwarp.ops.sparse.blocks import Running, convolve, gradients, parts_of, rows_of
 from sgwarp.ops.sparse.voxels import KernelMap
@@ -90,8 +90,8 @@ def _infer(
     z = features.new_empty(kernel_map.target_count, channels + further)
     if not z.numel():
         return z
-    grid = [parts_of(len(z), convolution_block.TARGETS)]
-    grid.append(sum(parts_of(n, convolution_block.CHANNELS) for n in (channels, further)))
+    grid = [parts_of(len(z), products_block.TARGETS)]
+    grid.append(sum(parts_of(n, products_block.CHANNELS) for n in (channels, further)))
     table, mirrored = kernel_map.table(by_target=True)
     nothing, running = features.new_empty(0, 0), norm.running
     inputs = [view(rows_of(features), wp.float32), view(weight, wp.float32), view(table, wp.int32), int(mirrored)]
@@ -166,7 +166,7 @@ class _Layer(torch.autograd.Function):
         known += [view(t, wp.float32) for t in (y, statistics)]
         if len(y) and (ctx.learns or for_gain or for_bias):
             per_part = max(ROWS, parts_of(len(y), MAX_PARTS))
-            grid = [parts_of(len(y), per_part), parts_of(channels, convolution_block.CHANNELS)]
+            grid = [parts_of(len(y), per_part), parts_of(channels, products_block.CHANNELS)]
             partial = scratch("sparse sums", 2 * grid[0] * channels, torch.float64, y.device)
             inputs = [*known, per_part, view(partial, wp.float64), view(counters(grid[1], y.device), wp.int32)]
             kernel, outputs = normalization_block.sum_normalized_blocks, [view(t, wp.float32) for t in (v_bias, v_gain)]
