@@ -167,9 +167,11 @@ def test_an_interrupted_batch_goes_on(labeled, tmp_path, capsys):
             time.sleep(0.01)
         started.send_signal(number)
         said = started.communicate()[1].decode()
-        assert started.returncode in (0, code)  # 0 if the last scene ended meanwhile
-        assert "Traceback" not in said
         records.append(list((tmp_path / "out").glob("[!.]*/done.json")))
+        # A signal that comes after the last scene finds nothing to end: the process is gone, or about to go.
+        too_late = len(records[-1]) == 2 and started.returncode in (0, -number)
+        assert started.returncode == code or too_late
+        assert "Traceback" not in said
     assert main([*map(str, words)]) == 0
     assert f"{len(records[-1])} skipped" in capsys.readouterr().out
     assert sorted(path.parent.name for path in (tmp_path / "out").glob("[!.]*/done.json")) == ["one", "two"]
