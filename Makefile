@@ -1,14 +1,15 @@
 # `make test` and `make demo` need Python 3.10 or later, make and a C library; everything else goes into .venv.
 .DEFAULT_GOAL := help
 .NOTPARALLEL:
-.PHONY: help test test-fast demo lint docs bench fuzz lock bill clean
+.PHONY: help test test-fast slow-tests demo lint docs bench fuzz lock bill clean
 
 VENV := .venv
 BIN := $(VENV)/bin
 ARGS ?=
 # Tests run in so many processes, files as a whole; WORKERS=0 runs them in one, for a debugger.
 WORKERS ?= 2
-PYTEST := OMP_NUM_THREADS=1 $(BIN)/python -m pytest -n $(WORKERS) --dist loadfile
+# With bytecode kept: pytest rewrites the assertions of every test file, which takes 20 s where it cannot keep them.
+PYTEST := PYTHONDONTWRITEBYTECODE= OMP_NUM_THREADS=1 $(BIN)/python -m pytest -n $(WORKERS) --dist loadfile
 SOURCES := $(wildcard sgwarp kernels tests notebooks benchmarks tools)
 
 # A name on PATH may be an empty shim, so each candidate has to run.
@@ -18,6 +19,7 @@ PYTHON ?= $(shell for name in python3 python python3.14 python3.13 python3.12 py
 help:
 	@echo "make test       install into $(VENV), run the tests       (ARGS='tests/io -x' for some of them)"
 	@echo "make test-fast  the same without the slow ones, for the inner loop"
+	@echo "make slow-tests measure them, and add what is slow to tests/slow_tests.txt"
 	@echo "make demo       install into $(VENV), run the demonstration; pictures and a table go to demo_out/"
 	@echo "make lint       ruff and mypy"
 	@echo "make docs       build the documentation into site/; warnings are errors"
@@ -34,6 +36,9 @@ test: $(VENV)/installed-test
 
 test-fast: $(VENV)/installed-test
 	$(PYTEST) -m "not slow" $(ARGS)
+
+slow-tests: $(VENV)/installed-test
+	$(PYTEST) -m "not slow" --record-slow $(ARGS)
 
 demo: $(VENV)/installed-demo
 	$(BIN)/sgwarp demo --out demo_out $(ARGS)

@@ -30,6 +30,7 @@ catalogue = _load("sgwarp_test_scenes", Path(__file__).with_name("scenes.py"))
 differences = _load("sgwarp_test_differences", Path(__file__).with_name("differences.py"))
 devices = _load("sgwarp_test_devices", Path(__file__).with_name("devices.py"))
 _pretended = _load("sgwarp_test_pretended", Path(__file__).with_name("pretended.py"))
+_slow_tests = _load("sgwarp_slow_tests", Path(__file__).with_name("slow_tests.py"))
 _stage = _load("sgwarp_test_stage", Path(__file__).with_name("stage.py"))
 stage, toy_text, stage_files = _stage.stage, _stage.toy_text, _stage.stage_files
 
@@ -71,7 +72,17 @@ def pretended_cuda():
         yield device
 
 
+def pytest_addoption(parser: pytest.Parser) -> None:
+    parser.addoption("--record-slow", action="store_true", help="add tests that take long to tests/slow_tests.txt")
+
+
+def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+    _slow_tests.mark(items)
+
+
 def pytest_configure(config: pytest.Config) -> None:
+    if config.getoption("--record-slow"):
+        config.pluginmanager.register(_slow_tests.Recorder())
     config.addinivalue_line("markers", "cpu_only(why): stays on the CPU, whatever SGWARP_TEST_DEVICE says")
     if devices.NAME != "cpu":
         # The machine with the device may have another torch, whose warnings are no fault of what is tested.

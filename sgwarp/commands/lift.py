@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
-from contextlib import ExitStack
+from contextlib import ExitStack, suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
 from sgwarp.commands.options import SceneOptions, check_name, find_views, place_views
+from sgwarp.errors import InputError
 from sgwarp.runs.progress import show_progress
 
 if TYPE_CHECKING:
@@ -148,12 +149,14 @@ class Lift(SceneOptions):
 
     def _live(self, gaussians: Gaussians, views: list[View]) -> Live:
         """A viewer that opens with the first view's semantics; asks in words where the encoder has a text side."""
-        from sgwarp.encoders.registry import make_text_encoder
+        from sgwarp.encoders.registry import encoder_of_questions
         from sgwarp.viewer.live import Live
         from sgwarp.viewer.workbench import Materials, Workbench
 
         def begin(semantics: Semantics) -> Workbench:
-            text = None if semantics.labels is not None else make_text_encoder(self.encoder, self.device)
+            text = None
+            with suppress(InputError):
+                text = encoder_of_questions(self.encoder, semantics.space, self.device)
             return Workbench(Materials(gaussians, semantics, None, text, views=views))
 
         return Live(begin, Workbench.replace_semantics)

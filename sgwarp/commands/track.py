@@ -153,13 +153,13 @@ class Track(Options):
         from sgwarp.apps.tracking.answers import Questions
         from sgwarp.apps.tracking.association import Associated
         from sgwarp.apps.tracking.fusion import FusionSettings
-        from sgwarp.apps.tracking.sources import FrameSource, open_source
+        from sgwarp.apps.tracking.sources import NamedSource, open_source
         from sgwarp.apps.tracking.tracker import Tracker, TrackSettings
         from sgwarp.encoders.cache import default_folder
-        from sgwarp.encoders.registry import make_encoder
+        from sgwarp.encoders.registry import encoder_of_questions, make_encoder
 
         folder = None if self.cache == "none" else self.cache or default_folder()
-        source: FrameSource = open_source(
+        source: NamedSource = open_source(
             self.encoder,
             views.at(0),
             lambda name, first: make_encoder(name, first, self.device, folder, self.cache_limit),
@@ -172,14 +172,9 @@ class Track(Options):
         settings = TrackSettings(fusion, self.incremental, self.foreground, device=self.device)
         classes = None if self.classes is None else tuple(class_names(self.classes))
         texts = () if self.text is None else tuple(class_names(self.text, "--text"))
-        encoder = self._text_encoder() if (classes or texts) and not self.encoder.startswith("files:") else None
+        encoder = encoder_of_questions(self.encoder, source.of_space, self.device) if classes or texts else None
         questions = Questions(classes, texts, encoder, self.scoring, self.temperature, self.unknown_below)
         return Tracker(source, settings, log), questions
-
-    def _text_encoder(self) -> Any:
-        from sgwarp.encoders.registry import make_text_encoder
-
-        return make_text_encoder(self.encoder, self.device)
 
     def _settings(self) -> dict[str, Any]:
         """What two runs must have in common for the second to go on from the first."""

@@ -107,6 +107,24 @@ def text_encoder_for(
     return encoder
 
 
+def encoder_of_questions(name: str, space: str, device: Device = "cpu") -> TextEncoder | None:
+    """What encodes phrases for the features that a source gives: its own text side, else that of their space.
+
+    Args:
+        name: Of the source.
+        space: Of its features; None is returned for label ids, which have no meanings.
+        device: Where it runs.
+
+    Raises:
+        InputError: Neither the source nor the space has a text side here.
+    """
+    if space == LABEL_SPACE:
+        return None
+    if all(member.text is not None or member.source.kind.speak for member in parse(name)):
+        return make_text_encoder(name, device)
+    return text_encoder_for(space, device=device)
+
+
 def image_tower_for(space: str, device: Device = "cpu") -> Callable[[], ImageEncoder] | None:
     """What makes the encoder of images for a space whose text encoder takes none; None if there is none here."""
     see = next((kind.see for kind in KINDS.values() if kind.see and kind.space == space), "")

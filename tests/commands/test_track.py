@@ -382,6 +382,20 @@ def test_the_encoder_is_made_with_cache_and_device(stopped, monkeypatch, tmp_pat
     assert asked.pop()[3] is None
 
 
+def test_features_from_files_are_asked_in_words(stopped, files, monkeypatch, tmp_path):
+    """Ids are not; so what the files hold decides, not how the source is called."""
+    asked = []
+    speak = "sgwarp.encoders.registry.text_encoder_for"
+    monkeypatch.setattr(speak, lambda space, device: asked.append((space, device)) or "words")
+    assert stopped("--classes", "a,b").questions.encoder is None
+    (tmp_path / "maps" / "00000").mkdir(parents=True)
+    for stem in ("0", "1", "2"):
+        np.save(tmp_path / "maps" / "00000" / f"{stem}.npy", np.ones((12, 16, 2), np.float32))
+    (tmp_path / "maps" / "00000" / "space.json").write_text('{"space": "mine"}')
+    call = stopped("--encoder", f"files:{tmp_path / 'maps'}", "--classes", "a,b")
+    assert (call.questions.encoder, asked) == ("words", [("mine", "cpu")])
+
+
 # Extremes, as files
 
 
@@ -489,7 +503,7 @@ def test_a_missing_photograph_costs_its_view_in_that_frame(files, tmp_path, monk
     shutil.copytree(files / "ims", views / "ims")
     shutil.copy(files / "train_meta.json", views)
     next((views / "ims" / "1").glob("*000001.*")).unlink()
-    parts = ["track", files / "params.npz", "--views", views, "--encoder", "gray", "--classes", "a,b"]
+    parts = ["track", files / "params.npz", "--views", views, "--encoder", "conse", "--classes", "a,b"]
     parts += ["--out", tmp_path / "out", "--frames", "3", "--no-pictures"]
     assert main([str(part) for part in parts]) == 0
     assert looked == ["0", "1", "2", "0", "2", "0", "1", "2"]

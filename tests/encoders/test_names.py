@@ -19,11 +19,12 @@ from sgwarp.encoders.ensemble import Ensemble
 from sgwarp.encoders.images.clip import JointEncoder
 from sgwarp.encoders.instances.detections import DetectorSettings
 from sgwarp.encoders.instances.vlpart import VLPartFiles
+from sgwarp.encoders.maps.files import LABEL_SPACE
 from sgwarp.encoders.masks.files import FileMasks
 from sgwarp.encoders.masks.proposals import Proposals
 from sgwarp.encoders.masks.sam import Sam
 from sgwarp.encoders.names import parse
-from sgwarp.encoders.registry import make_encoder, make_text_encoder, text_encoder_for
+from sgwarp.encoders.registry import encoder_of_questions, make_encoder, make_text_encoder, text_encoder_for
 from sgwarp.errors import InputError
 
 
@@ -171,6 +172,15 @@ def test_text_sides(joint_models, tmp_path):
     plain = make_text_encoder(clip, templates=["plain"]).encode_text(["couch"])
     assert not torch.allclose(plain, encoder.encode_text(["couch"]))
     torch.testing.assert_close(plain, make_text_encoder(f"{clip}?templates={{}}").encode_text(["couch"]))
+
+
+def test_questions_go_to_the_sources_own_text_side_or_to_that_of_its_space(joint_models, tmp_path):
+    clip = f"clip:{joint_models['clip']}?templates=plain"
+    own = encoder_of_questions(clip, "whatever it gives")
+    torch.testing.assert_close(own.encode_text(["couch"]), make_text_encoder(clip).encode_text(["couch"]))
+    assert encoder_of_questions(f"files:{tmp_path}", LABEL_SPACE) is None
+    with pytest.raises(InputError, match="no text encoder for space 'mine' is known"):
+        encoder_of_questions(f"files:{tmp_path}", "mine")
 
 
 def test_features_per_gaussian_are_no_source_of_maps():

@@ -34,6 +34,7 @@ class Associated:
     """
 
     needs_image = False
+    of_space = LABEL_SPACE
 
     def __init__(self, source: FrameSource) -> None:
         self.source = source

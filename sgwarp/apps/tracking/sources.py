@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Protocol
 
@@ -29,12 +29,20 @@ class FrameSource(Protocol):
         ...
 
 
+class NamedSource(FrameSource, Protocol):
+    """A source that knows the space of its features, "labels" for ids."""
+
+    @property
+    def of_space(self) -> str: ...
+
+
 class EveryFrame:
     """An encoder that looks at each photograph by itself."""
 
     def __init__(self, source: MapSource) -> None:
         self.source = source
         self.needs_image = source.needs_image
+        self.of_space = source.space
 
     def encode(self, frame: int, view: FrameView, image: Tensor | None) -> FeatureMap:
         return self.source.encode(view.view, image)
@@ -66,6 +74,7 @@ class LabelFrames:
     """
 
     needs_image = False
+    of_space = LABEL_SPACE
 
     def __init__(self, folder: Path, labels: tuple[str, ...] = ()) -> None:
         self.folder = folder
@@ -98,23 +107,26 @@ class FileFrames:
 
     needs_image = False
 
-    def __init__(self, folder: Path) -> None:
+    def __init__(self, folder: Path, first: Sequence[FrameView]) -> None:
         self.folder = folder
-        self._open: tuple[int, FileMaps] | None = None
+        self._open = 0, FileMaps(self._place(0), [view.view for view in first])
+        self.of_space = self._open[1].space
 
     def encode(self, frame: int, view: FrameView, image: Tensor | None) -> FeatureMap:
-        if self._open is None or self._open[0] != frame:
-            places = [self.folder / f"{frame:05d}", self.folder / str(frame)]
-            place = next((place for place in places if place.is_dir()), None)
-            if place is None:
-                raise MissingMap(f"{self.folder}: holds no folder of frame {frame}")
-            self._open = frame, FileMaps(place, [view.view])
+        if self._open[0] != frame:
+            self._open = frame, FileMaps(self._place(frame), [view.view])
         return self._open[1].encode(view.view)
+
+    def _place(self, frame: int) -> Path:
+        for name in (f"{frame:05d}", str(frame)):
+            if (self.folder / name).is_dir():
+                return self.folder / name
+        raise MissingMap(f"{self.folder}: holds no folder of frame {frame}")
 
 
 def open_source(
     name: str, first: list[FrameView], make: Callable[[str, list[View]], MapSource], labels: tuple[str, ...] = ()
-) -> FrameSource:
+) -> NamedSource:
     """The source of maps that an encoder's name stands for.
 
     Args:
@@ -133,6 +145,6 @@ def open_source(
     if any(labeled.find(0, view) for view in first):
         return labeled
     if any((Path(folder) / place).is_dir() for place in ("00000", "0")):
-        return FileFrames(Path(folder))
+        return FileFrames(Path(folder), first)
     looked = f"{folder}/00000/{first[0].view.stem}.png" if first else folder
     raise InputError(f"{folder}: holds no maps of frame 0; looked for {looked} and the like")

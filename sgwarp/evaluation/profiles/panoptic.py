@@ -14,12 +14,12 @@ from torch import Tensor
 
 from sgwarp.apps.tracking.answers import Questions, answer
 from sgwarp.apps.tracking.fusion import FusionSettings
-from sgwarp.apps.tracking.sources import FrameSource, open_source
+from sgwarp.apps.tracking.sources import NamedSource, open_source
 from sgwarp.apps.tracking.tracker import Tracker, TrackSettings, count_frames
 from sgwarp.datasets.base import SceneData, resize_nearest
 from sgwarp.datasets.moving import with_label_noise
 from sgwarp.encoders.maps.files import LABEL_SPACE
-from sgwarp.encoders.registry import make_encoder, make_text_encoder
+from sgwarp.encoders.registry import encoder_of_questions, make_encoder
 from sgwarp.errors import InputError
 from sgwarp.evaluation.cases import Split, split_without_views
 from sgwarp.evaluation.profiles.base import Profile, add_confusion, total_pooled
@@ -47,7 +47,7 @@ class MovingCase:
     sequence: GaussianSequence
     views: MovingViews
     asked: MovingViews
-    source: FrameSource
+    source: NamedSource
     log: RunLog
     gaussians: Any = ()
     lifted: list[FrameView] = field(default_factory=list)
@@ -59,6 +59,7 @@ class TrueFrames:
     """Drawn labels of every frame and view as maps, with a share of their regions wrong."""
 
     needs_image = False
+    of_space = LABEL_SPACE
 
     def __init__(self, scene: SceneData, noise: float, seed: int) -> None:
         self.scene, self.noise, self.seed = scene, noise, seed
@@ -96,7 +97,7 @@ def open_moving(scene: SceneData, settings: Settings, split: Split, log: RunLog)
     asked = load_moving_views(scene.folder, "test") if strict else views
     noise = noise_of(settings.encoder)
     if noise is not None:
-        source: FrameSource = TrueFrames(scene, noise, settings.seed)
+        source: NamedSource = TrueFrames(scene, noise, settings.seed)
     else:
         name = settings.encoder.replace("{scene}", scene.name).replace("{path}", str(scene.folder))
         source = open_source(name, views.at(0), lambda n, one: make_encoder(n, one, settings.device, settings.cache))
@@ -106,8 +107,8 @@ def open_moving(scene: SceneData, settings: Settings, split: Split, log: RunLog)
 def score_moving(case: MovingCase, result: SceneResult, sheets: Path) -> None:
     """One confusion matrix over frames and asked cameras, and how often an object is taken for another than before."""
     classes, settings = case.scene.classes, case.settings
-    labels_asked = noise_of(settings.encoder) is not None or settings.encoder.startswith("files:")
-    encoder = None if labels_asked else make_text_encoder(settings.encoder, settings.device)
+    encoder = encoder_of_questions(settings.encoder, case.source.of_space, settings.device)
+    labels_asked = encoder is None
     questions = Questions(None if labels_asked else classes, (), encoder, settings.scoring)
     fusion = FusionSettings(forgetting=settings.forgetting)
     tracker = Tracker(case.source, TrackSettings(fusion, device=settings.device), case.log)
