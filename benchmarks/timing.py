@@ -32,7 +32,7 @@ STAGES: tuple[tuple[str, ModuleType, str], ...] = (
     ("project backward", backward, "project_backward"),
     ("shade backward", backward, "shade_backward"),
 )
-SUMS = "sum_intersections"
+SUMS = "sum_used_rows"
 
 
 @dataclass(frozen=True)

@@ -3,7 +3,7 @@
 Gaussians are sorted once by (depth, index); a stable counting pass then writes every tile's list in that order, so
 the intersections themselves are never sorted. On the CPU the counting pass runs in slices of the depth order: each
 slice counts its own tiles, prefix sums turn the counts into disjoint places, and each slice fills them. Any number of
-threads writes the same lists.
+threads writes the same lists (`binning_lanes.py`).
 
 On CUDA one thread per Gaussian emits its (tile, entry) pairs in depth order; a stable radix sort by tile alone then
 gives the same lists.
@@ -100,105 +100,8 @@ def order_splats(
     # Out:
     ordered_out: wp.array[Splat],  # [V]
 ):
-    """Bring the splats into a given order, for lists that were made elsewhere; `count_tiles` does it on its way."""
+    """Bring the splats into a given order, for lists that were made elsewhere; counting does it on its way."""
     order_splat(base + wp.tid(), order, splats, colors, ordered_out)
-
-
-SPANS = wp.constant(4)  # tile rows of a splat whose columns the counting pass keeps for the filling pass
-MOST_COLUMNS = wp.constant(256)  # of tiles, so that a column takes eight bits
-
-
-@wp.func
-def with_span(spans: wp.uint64, place: int, first: int, last: int) -> wp.uint64:
-    """Keep the columns of the splat's tile row number `place`, unless it is too far down."""
-    kept = spans
-    if place < SPANS:
-        kept = spans | (wp.uint64(first + (last << 8)) << wp.uint64(16 * place))
-    return kept
-
-
-@wp.func
-def span_of(spans: wp.uint64, place: int):
-    """First and last column that `with_span` kept."""
-    span = int((spans >> wp.uint64(16 * place)) & wp.uint64(0xFFFF))
-    return span & 255, span >> 8
-
-
-@wp.kernel
-def count_tiles(
-    # In:
-    base: int,  # first slice of this launch
-    order: wp.array[int],  # [V] visible Gaussians by (depth, index)
-    splats: wp.array[Splat],  # [N]
-    colors: wp.array[wp.vec3],  # [V] or empty
-    per_slice: int,  # splats in a slice
-    width: int,  # [pixels]
-    height: int,
-    # Out:
-    ordered_out: wp.array[Splat],  # [V] in depth order, where all later passes read them
-    tile_counts_out: wp.array2d[int],  # [slices, tiles] zeroed
-    splat_counts_out: wp.array[int],  # [V] tiles that each splat touches
-    spans_out: wp.array[wp.uint64],  # [V] columns of its first tile rows
-):
-    """Bring the splats into depth order and count intersections per (slice, tile) and splat. One thread per slice."""
-    s = base + wp.tid()
-    columns = (width + TILE - 1) / TILE
-    for k in range(s * per_slice, wp.min((s + 1) * per_slice, order.shape[0])):
-        prefetch(splats, order[wp.min(k + AHEAD, order.shape[0] - 1)])
-        order_splat(k, order, splats, colors, ordered_out)
-        splat = splats[order[k]]
-        box_first, box_last = box_columns(splat, width)
-        total = int(0)
-        spans = wp.uint64(0)
-        first_row, last_row = tile_rows(splat, height)
-        for row in range(first_row, last_row + 1):
-            first, last = row_columns(splat, row, width, box_first, box_last)
-            for column in range(first, last + 1):
-                tile_counts_out[s, row * columns + column] += 1
-            total += wp.max(last - first + 1, 0)
-            spans = with_span(spans, row - first_row, first, last)
-        splat_counts_out[k] = total
-        spans_out[k] = spans
-
-
-@wp.kernel
-def fill_tiles(
-    # In:
-    base: int,
-    splats: wp.array[Splat],  # [V] in depth order
-    per_slice: int,
-    width: int,
-    height: int,
-    entries: wp.array[int],  # [V] first entry of each splat
-    spans: wp.array[wp.uint64],  # [V] from `count_tiles`
-    # In and out:
-    cursors: wp.array2d[int],  # [slices, tiles] next free place of each (slice, tile)
-    # Out:
-    listed_out: wp.array[int],  # [I] ranks of the splats, tile by tile, front to back
-    places_out: wp.array[int],  # [I] place of each entry; or empty
-    tiles_out: wp.array[int],  # [I] tile of each entry; or empty
-):
-    """Write the tile lists. One thread per slice; the cursors keep slices apart."""
-    s = base + wp.tid()
-    columns = (width + TILE - 1) / TILE
-    for k in range(s * per_slice, wp.min((s + 1) * per_slice, splats.shape[0])):
-        entry = entries[k]
-        first_row, last_row = tile_rows(splats[k], height)
-        for row in range(first_row, last_row + 1):
-            first, last = span_of(spans[k], wp.min(row - first_row, SPANS - 1))
-            if row - first_row >= SPANS or columns > MOST_COLUMNS:
-                box_first, box_last = box_columns(splats[k], width)
-                first, last = row_columns(splats[k], row, width, box_first, box_last)
-            for column in range(first, last + 1):
-                tile = row * columns + column
-                place = cursors[s, tile]
-                cursors[s, tile] = place + 1
-                listed_out[place] = k
-                if places_out.shape[0] > 0:
-                    places_out[entry] = place
-                if tiles_out.shape[0] > 0:
-                    tiles_out[entry] = tile
-                entry += 1
 
 
 @wp.kernel

@@ -31,7 +31,7 @@ from matplotlib.collections import EllipseCollection
 from matplotlib.patches import Rectangle
 
 import sgwarp as sg
-from sgwarp.kernels import binning
+from sgwarp.kernels import binning_lanes
 from sgwarp.kernels.compositing import block as compositing_block
 from sgwarp.kernels.compositing import lanes as compositing_lanes
 from sgwarp.kernels.compositing import lanes_features as compositing_lanes_features
@@ -320,8 +320,9 @@ def bin_splats(camera, splats, status, depths):
     tile_counts, splat_counts = wp.zeros((1, TILES), dtype=int), wp.zeros(count, dtype=int)
     sizes = [count, WIDTH, HEIGHT]
     spans = wp.zeros(count, dtype=wp.uint64)  # columns that a splat touches, kept from counting for filling
-    outputs = [ordered, tile_counts, splat_counts, spans]
-    wp.launch(binning.count_tiles, 1, [0, order, splats, colors, *sizes], outputs)
+    rows = wp.zeros(count, dtype=int)  # and the tile rows
+    outputs = [ordered, tile_counts, splat_counts, spans, rows]
+    wp.launch(binning_lanes.count_tiles, 1, [0, order, splats, colors, *sizes], outputs)
     offsets, entries = starts(tile_counts.numpy()[0]), starts(splat_counts.numpy())
     listed, places, tiles = (wp.zeros(int(offsets[-1]), dtype=int) for _ in range(3))
     lists = {
@@ -334,7 +335,8 @@ def bin_splats(camera, splats, status, depths):
         "tiles": tiles,  # [I] tile of each entry
     }
     cursors = wp.array(offsets[None, :-1].copy())
-    wp.launch(binning.fill_tiles, 1, [0, ordered, *sizes, lists["entries"], spans, cursors], [listed, places, tiles])
+    inputs = [0, ordered, *sizes, lists["entries"], spans, rows, cursors]
+    wp.launch(binning_lanes.fill_tiles, 1, inputs, [listed, places, tiles])
     return lists
 
 

@@ -14,7 +14,8 @@ Along a row only u changes, and from row to row u and v change by b and c. So a 
 vectors, d its distance to the middle one of the rows at work, and the six moments follow once per fragment. Counted
 from the middle, d b stays as small as a tile, and nothing large cancels.
 
-The thread that owns a tile writes one row for each place of its list, so no two threads write the same memory.
+The thread that owns a tile writes one row for each place of its list, so no two threads write the same memory. Places
+that no pixel saw, a third in a room, have none: `used` says so in one byte each.
 """
 
 from functools import cache
@@ -73,7 +74,8 @@ def make_composite_backward(wide: bool, depth: bool, absolute: bool) -> wp.Kerne
         state: wp.array3d[Lanes],  # [slots, 16, 2] scratch: transmittance, value behind
         reach: wp.array2d[int],  # [slots, 16] scratch: last contributor of each row
         # Out:
-        rows_out: wp.array[Lanes],  # [I] by place, column q in lane q
+        rows_out: wp.array[Lanes],  # [I] by place, column q in lane q; written where used
+        used_out: wp.array[wp.uint8],  # [I] by place: whether some pixel saw the fragment
         features_out: wp.array2d[Lanes],  # [I, S] gradient of the features, by place; or empty (wide)
     ):
         """Paper eq. 1, differentiated, for one tile per thread."""
@@ -93,7 +95,7 @@ def make_composite_backward(wide: bool, depth: bool, absolute: bool) -> wp.Kerne
             tile_reach = wp.max(tile_reach, row_reach)
         first = offsets[tile]
         for k in range(first + tile_reach + 1, offsets[tile + 1]):
-            rows_out[k] = Lanes(0.0)
+            used_out[k] = wp.uint8(0)
             if wp.static(wide):
                 for s in range(features_out.shape[1]):
                     features_out[k, s] = Lanes(0.0)
@@ -121,6 +123,7 @@ def make_composite_backward(wide: bool, depth: bool, absolute: bool) -> wp.Kerne
                 state,
                 reach,
                 rows_out,
+                used_out,
                 features_out,
             )
 

@@ -158,7 +158,7 @@ BACKWARD = """
     const Ints row_ends = *reinterpret_cast<const Ints*>(reach.data + slot * 16);
     const unsigned left = see(s, x0, y0, knobs, middles, tops) & bits(row_ends >= order);
     if (!left) {
-        *reinterpret_cast<Row*>(rows.data + place) = zero;
+        used.data[place] = 0;
         for (int j = 0; WIDE && j < features_out.shape[1]; ++j)
             reinterpret_cast<Row*>(features_out.data)[place * features_out.shape[1] + j] = zero;
         return;
@@ -233,6 +233,7 @@ BACKWARD = """
     const Row q0 = FOLD_4(p0, p1), q1 = FOLD_4(p2, p3), q2 = FOLD_4(p4, p5);
     const Row r0 = FOLD_2(q0, q1), r1 = FOLD_2(q2, zero);
     *reinterpret_cast<Row*>(rows.data + place) = FOLD_1(r0, r1);
+    used.data[place] = 1;
 #if SGWARP_WIDE
     FEATURES
 #endif
@@ -324,6 +325,7 @@ def fragment_replay(wide: bool, depth: bool, absolute: bool, min_passed: float) 
         state: wp.array3d[Lanes],  # [slots, 16, 2] transmittance, value behind
         reach: wp.array2d[int],  # [slots, 16]
         rows: wp.array[Lanes],  # [I] by place, column q in lane q
+        used: wp.array[wp.uint8],  # [I] whether there is one
         features_out: wp.array2d[Lanes],  # [I, S] by place, or empty (wide)
     ): ...
 

@@ -96,7 +96,7 @@ FIGURES = [
     ("lifting/shared.py", "MAX_IDS", "`tile_ids` [tiles, {}]"),
     ("sparse/convolution_lanes.py", "COLUMNS", "C_out / {}, C_in, {}] flat"),
     ("sparse/convolution_lanes.py", "GRADIENT_GROUP", "groups of {} C_in"),
-    ("binning.py", "SPANS", "first four tile rows"),
+    ("binning_lanes.py", "SPANS", "first four tile rows"),
 ]
 
 

@@ -12,6 +12,7 @@ from torch.nn.functional import pad
 
 from sgwarp.kernels.compositing import block_backward as compositing_block_backward
 from sgwarp.kernels.compositing import lanes_backward as compositing_lanes_backward
+from sgwarp.kernels.compositing import lanes_sums
 from sgwarp.kernels.compositing.lanes_backward import MOMENTS, row_columns
 from sgwarp.kernels.harmonics import backward as harmonics_backward
 from sgwarp.kernels.lifting import shared as lifting
@@ -115,6 +116,7 @@ def composite_backward(
     at_depth, at_absolute, _ = row_columns(wide, depth, absolute)
     sums = torch.zeros(count, LANE, device=device)
     rows = scratch("backward rows", lists.intersections * LANE if ordered else 0, torch.float32, device).view(-1, LANE)
+    used = scratch("rows in use", 0 if block else lists.intersections, torch.uint8, device)
     slices = in_slices(features if wide and features is not None else zeros[:1, :1])
     together = wide and not block and slices.shape[1] <= TOGETHER
     shape = (lists.intersections, slices.shape[1], LANE) if together else (0, 0, LANE)
@@ -149,9 +151,11 @@ def composite_backward(
         ]
         inputs = [*head, view(slices.unsqueeze(2), Lanes), *maps, *size]
         kernel = compositing_lanes_backward.make_composite_backward(wide, depth, absolute)
-        outputs = [view(rows, Lanes), view(feature_rows, Lanes)]
+        outputs = [view(rows, Lanes), view(used, wp.uint8), view(feature_rows, Lanes)]
         launch(kernel, lists.tile_count, [*inputs, *scratches], outputs, device=device, slots=True)
-    if ordered:
+        inputs = [*lists.sums(), view(used, wp.uint8), view(rows, Lanes)]
+        launch(lanes_sums.sum_used_rows, len(lists.order), inputs, [view(sums, Lanes)], device=device)
+    if block and ordered:
         inputs = [*lists.sums(), view(rows, Lanes)]
         launch(kernels.sum_intersections, len(lists.order), inputs, [view(sums, Lanes)], device=device)
     if gradients.surface is not None and count:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import torch
 import warp as wp
 
-from sgwarp.kernels import binning
+from sgwarp.kernels import binning_lanes
 from sgwarp.kernels.lifting import lanes, lanes_wide, shared
 from sgwarp.kernels.projection import lanes as projection_lanes
 from sgwarp.kernels.transmittance import LANES
@@ -32,4 +32,5 @@ def load_lifting(device: torch.device, channels: int, *, ids: bool, squared: boo
         kernels += [lanes_wide.sum_tiles, *(lanes.make_lift_dense(1, squared) for _ in pass_widths(channels)[1:])]
     else:
         kernels = [lanes.make_lift_dense(width, squared) for width in pass_widths(channels)]
-    load_together([kernels[0], projection_lanes.project_groups, *kernels[1:], shared.sum_rows, binning.count_tiles])
+    shared_by_all = [shared.sum_rows, binning_lanes.count_tiles]
+    load_together([kernels[0], projection_lanes.project_groups, *kernels[1:], *shared_by_all])

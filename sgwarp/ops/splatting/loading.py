@@ -8,14 +8,14 @@ from __future__ import annotations
 import torch
 import warp as wp
 
-from sgwarp.kernels import binning
+from sgwarp.kernels import binning_lanes
 from sgwarp.kernels.compositing.lanes import make_composite_colors
 from sgwarp.kernels.compositing.lanes_backward import make_composite_backward
 from sgwarp.kernels.compositing.lanes_features import make_composite_features
+from sgwarp.kernels.compositing.lanes_sums import sum_used_rows
 from sgwarp.kernels.harmonics.backward import harmonics_backward
 from sgwarp.kernels.harmonics.forward import evaluate_harmonics
 from sgwarp.kernels.projection import lanes as projection_lanes
-from sgwarp.kernels.projection.backward import sum_intersections
 from sgwarp.kernels.transmittance import LANES
 from sgwarp.ops.launcher import load_together
 
@@ -39,8 +39,8 @@ def load_rendering(
     colors = make_composite_colors(depth, backward)
     needed: list[wp.Kernel] = [make_composite_backward(False, depth, absolute) if backward else colors]
     # Both kernels of the projection are in one module.
-    needed += [projection_lanes.project_groups, colors] + [evaluate_harmonics] * harmonics + [binning.count_tiles]
-    needed += [sum_intersections] * backward + [harmonics_backward] * (harmonics and backward)
+    needed += [projection_lanes.project_groups, colors] + [evaluate_harmonics] * harmonics + [binning_lanes.count_tiles]
+    needed += [sum_used_rows] * backward + [harmonics_backward] * (harmonics and backward)
     load_together(needed)
 
 
@@ -50,7 +50,7 @@ def load_wide_rendering(device: torch.device, channels: int, *, depth: bool) -> 
         return
     first, *others = (make_composite_features(width, False) for width in pass_widths(channels))
     needed: list[wp.Kernel] = [first, projection_lanes.project_groups, *others]
-    load_together([*needed, *[make_composite_colors(True, False)] * depth, binning.count_tiles])
+    load_together([*needed, *[make_composite_colors(True, False)] * depth, binning_lanes.count_tiles])
 
 
 def pass_widths(channels: int) -> list[int]:

@@ -12,7 +12,7 @@ import warp as wp
 from torch import Tensor
 
 from sgwarp.errors import InputError
-from sgwarp.kernels import binning
+from sgwarp.kernels import binning, binning_lanes
 from sgwarp.kernels.gaussian import Pinhole, Splat
 from sgwarp.kernels.harmonics import forward as harmonics
 from sgwarp.kernels.projection import forward as projection
@@ -278,8 +278,9 @@ def bin_by_counting(
     splats = as_splats(memory)
     inputs = [view(order, wp.int32), projected.splats, colors, *sizes]
     spans = view(scratch("spans", count, torch.int64, device), wp.uint64)
-    outputs = [splats, view(tile_counts, wp.int32), view(splat_counts, wp.int32), spans]
-    launch(binning.count_tiles, SLICES, inputs, outputs, device=device, chunk=1)
+    rows = view(scratch("tile rows", count, torch.int32, device), wp.int32)
+    outputs = [splats, view(tile_counts, wp.int32), view(splat_counts, wp.int32), spans, rows]
+    launch(binning_lanes.count_tiles, SLICES, inputs, outputs, device=device, chunk=1)
     entries, total = _first_places(splat_counts)
     # Tile by tile, and within a tile slice by slice, so that each slice continues where the one in front ended.
     by_tile = tile_counts.t().reshape(-1)
@@ -290,9 +291,8 @@ def bin_by_counting(
         for name, wanted in (("listed", True), ("places", places), ("tiles", tiles))
     )
     outputs = [view(t, wp.int32) for t in (cursors, listed, places_of, tiles_of)]
-    launch(
-        binning.fill_tiles, SLICES, [splats, *sizes, view(entries, wp.int32), spans], outputs, device=device, chunk=1
-    )
+    inputs = [splats, *sizes, view(entries, wp.int32), spans, rows]
+    launch(binning_lanes.fill_tiles, SLICES, inputs, outputs, device=device, chunk=1)
     return TileLists(order, memory, offsets, listed, entries, places_of, tiles_of)
 
 
