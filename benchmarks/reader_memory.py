@@ -84,7 +84,7 @@ def sog(folder: Path, size: int, degree: int) -> Path:
                 pixels[..., 3] = rng.integers(*alpha, (height, columns)) if isinstance(alpha, tuple) else alpha
                 if name == "shN_labels.webp":
                     pixels[..., 0] = 0
-                done, data = cv2.imencode(".webp", pixels, [cv2.IMWRITE_WEBP_QUALITY, 101])  # above 100: lossless
+                _, data = cv2.imencode(".webp", pixels, [cv2.IMWRITE_WEBP_QUALITY, 101])  # above 100: lossless
                 archive.writestr(name, data.tobytes())
 
         add("means", ("means_l.webp", "means_u.webp"), side, side)

@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from contextlib import ExitStack
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
+from sgwarp.commands.inputs_kept import LOG
 from sgwarp.commands.options import SceneOptions, check_name, find_views, place_views
 from sgwarp.runs.progress import show_progress
 
@@ -81,6 +83,9 @@ class Lift(SceneOptions):
 
     view: bool = False
     """Show the scene in the browser while it is lifted, and the result until Ctrl-C."""
+
+    def written(self) -> Iterator[tuple[str, list[Path]]]:
+        yield "--out", [self.out, self.out.parent / LOG]
 
     def run(self) -> None:
         check_name("--out", self.out, ".safetensors")

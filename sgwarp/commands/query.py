@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Literal
 
-from sgwarp.commands.inputs_kept import keep_photographs
+from sgwarp.commands.inputs_kept import LOG, keep_photographs
 from sgwarp.commands.options import SemanticsOptions, check_name, find_view, find_views, photograph, place_views
 from sgwarp.errors import InputError
 
@@ -52,6 +53,10 @@ class Query(SemanticsOptions):
 
     images: str | None = None
     """Name of a COLMAP model's folder of photographs, if it is not `images` nor the only one that holds them."""
+
+    def written(self) -> Iterator[tuple[str, list[Path]]]:
+        heat = self.out.with_name(f"{self.out.stem}_heat.png")
+        yield "--out", [self.out, heat, self.out.parent / LOG]
 
     def run(self) -> None:
         check_name("--out", self.out, ".png")

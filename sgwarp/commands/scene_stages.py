@@ -16,6 +16,7 @@ from sgwarp.cluster.listing import Scene
 from sgwarp.cluster.tasks import OUT, Stage
 from sgwarp.commands.evaluate import Evaluate
 from sgwarp.commands.fit import Fit
+from sgwarp.commands.inputs_kept import guarded
 from sgwarp.commands.instances import Instances
 from sgwarp.commands.lift import Lift
 from sgwarp.commands.options import Options
@@ -134,7 +135,8 @@ def run_stage(name: str, arguments: Sequence[str]) -> None:
         command.resume = command.out.with_name(f"{command.out.name}.checkpoint").is_file()
     command.command_line = shlex.join(["sgwarp", name, *arguments])
     _show_notices()
-    command.run()
+    with guarded(command):
+        command.run()
 
 
 def parse(name: str, arguments: Sequence[str]) -> Any:

@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Literal
 
-from sgwarp.commands.inputs_kept import keep_maps, keep_photographs
+from sgwarp.commands.inputs_kept import LOG, keep_maps, keep_photographs
 from sgwarp.commands.options import SemanticsOptions, check_folder, find_views, photograph, place_views
 from sgwarp.errors import InputError
 from sgwarp.runs.progress import show_progress
@@ -52,6 +53,9 @@ class Segment(SemanticsOptions):
 
     images: str | None = None
     """Name of a COLMAP model's folder of photographs, if it is not `images` nor the only one that holds them."""
+
+    def written(self) -> Iterator[tuple[str, list[Path]]]:
+        yield "--out", [self.out / LOG]
 
     def run(self) -> None:
         check_folder("--out", self.out)

@@ -1,8 +1,9 @@
 """What a command reads is never written over; readers and writers of files meet here.
 
-While `inputs_kept` is open, every file that is read (`access.reading`), and every photograph that a data set names, is an
-input. Such a file is refused as an output, and an output that was announced is refused as an input, so that the slip is
-found before the work is done where its name is known, and before anything is lost in any case. Files are compared by
+While `inputs_kept` is open, every file that is read (`access.reading`), and every photograph that a data set names, is
+an input. Such a file is refused as an output. Where an output was announced and is then read, the next stage of the
+work is refused (not the reading: a reader may take a file that it cannot have for one to leave out). So the slip is
+found before the work is done where names are known, and before anything is lost in any case. Files are compared by
 what they are, not by name: links do not hide them.
 
 A command's own state (a checkpoint that it goes on from, a map in its cache, a record of an earlier run) is read inside
@@ -28,6 +29,7 @@ class _Watch:
     read: dict[Identity, str] = field(default_factory=dict)
     announced: dict[Identity, str] = field(default_factory=dict)
     made: set[Identity] = field(default_factory=set)
+    slip: str = ""  # an announced output that was read
 
 
 _watch: _Watch | None = None  # of the command that this process runs; its readers may be in other threads
@@ -56,18 +58,14 @@ def own_files() -> Iterator[None]:
 
 
 def note_input(path: Name, found: os.stat_result | None = None) -> None:
-    """A file that is read, or named as belonging to what is read.
-
-    Raises:
-        InputError: It was announced as an output.
-    """
+    """A file that is read, or named as belonging to what is read."""
     if _watch is None or _own.get():
         return
     known = identity(path) if found is None else (found.st_dev, found.st_ino)
     if known is None or known in _watch.made:
         return
-    if (option := _watch.announced.get(known)) is not None:
-        raise InputError(f"{option}: would be written over {os.fspath(path)}, which this command reads; choose another")
+    if known in _watch.announced:
+        _watch.slip = _watch.slip or _watch.announced[known]
     _watch.read[known] = os.fspath(path)
 
 
@@ -79,24 +77,40 @@ def announce_outputs(option: str, paths: Iterable[Name]) -> None:
     """
     if _watch is None:
         return
+    require_apart()
     for path in paths:
         known = identity(path)
         if known is not None:
             _refuse(option, path, known)
-            _watch.announced[known] = f"{option} ({os.fspath(path)})"
+            _watch.announced[known] = f"{option} {os.fspath(path)}"
+
+
+def require_apart() -> None:
+    """Refuse to go on where an announced output was read.
+
+    Raises:
+        InputError: One was.
+    """
+    if _watch is not None and _watch.slip:
+        raise InputError(f"{_watch.slip}: is read by this command; choose another name or folder")
 
 
 def require_no_input(path: Name) -> None:
-    """Raises:
-    InputError: A file that is about to be written was read before.
+    """Refuse to write a file that was read.
+
+    Raises:
+        InputError: It was, or another output was.
     """
+    require_apart()
     if _watch is not None and (known := identity(path)) is not None:
         _refuse("output", path, known)
 
 
 def require_no_inputs_in(folder: Name) -> None:
-    """Raises:
-    InputError: A folder that is about to be removed holds a file that was read.
+    """Refuse to remove a folder that holds a file that was read.
+
+    Raises:
+        InputError: It does.
     """
     if _watch is None or not _watch.read:
         return

@@ -10,7 +10,7 @@ import json
 import math
 import os
 from collections.abc import Collection, Mapping, Sequence
-from typing import Any, BinaryIO
+from typing import Any, BinaryIO, TypeGuard
 
 import torch
 from torch import Tensor
@@ -109,7 +109,7 @@ def _header(
     return metadata, places
 
 
-def _whole(values: Any) -> bool:
+def _whole(values: Any) -> TypeGuard[list[int]]:
     return isinstance(values, list) and all(type(value) is int and 0 <= value < 2**62 for value in values)
 
 
@@ -119,7 +119,7 @@ def _tensor(
     """The next numbers of the file."""
     tensor = torch.empty(shape, dtype=torch.uint8 if dtype == torch.bool else dtype)
     if tensor.numel():
-        view = memoryview(tensor.reshape(-1).view(torch.uint8).numpy())
+        view = tensor.reshape(-1).view(torch.uint8).numpy().data
         if file.readinto(view) != len(view):  # type: ignore[attr-defined]
             raise _damaged(path, f"it ends in tensor {name[:80]!r}")
     # A byte that is neither 0 nor 1 is no bool, to any library.

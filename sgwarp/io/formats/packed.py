@@ -1,4 +1,4 @@
-"""How much a compressed scene may unpack to, and how it is unpacked: in blocks, straight into the arrays of the scene."""
+"""How much a compressed scene may unpack to, and the blocks in which it is unpacked."""
 
 from __future__ import annotations
 

@@ -245,7 +245,7 @@ def _picture(path: Path, name: str, data: bytes, least: int) -> NDArray[np.uint8
     red = pixels[:, :, 2].copy()
     pixels[:, :, 2] = pixels[:, :, 0]
     pixels[:, :, 0] = red
-    return pixels
+    return pixels  # type: ignore[return-value]
 
 
 def webp_size(data: bytes) -> tuple[int, int] | None:
