@@ -8,6 +8,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
+from sgwarp.commands.effects import say_unused
 from sgwarp.commands.inputs_kept import LOG
 from sgwarp.commands.options import SceneOptions, check_name, find_views, place_views
 from sgwarp.runs.progress import show_progress
@@ -17,6 +18,9 @@ if TYPE_CHECKING:
     from sgwarp.scene import Gaussians, Semantics, View
     from sgwarp.viewer.live import Live
     from sgwarp.viewer.workbench import Workbench
+
+OF_VIEWS = ("transform", "cache", "cache_limit", "mode", "tau", "border", "passes", "ridge", "iterations")
+OF_VIEWS += ("reliability", "fill", "share_of_views", "photographs", "deterministic", "images", "view")
 
 
 @dataclass(kw_only=True)
@@ -106,6 +110,7 @@ class Lift(SceneOptions):
             if source.kind.fused:
                 from sgwarp.encoders.building import builder
 
+                say_unused(self, OF_VIEWS, f"{self.encoder} holds features of Gaussians, nothing is lifted")
                 semantics = builder(source.kind.fused)(source.argument, gaussians, source.options.get("space"))
                 log.error["coverage"] = semantics.coverage
                 notes: dict[str, Any] = {"encoder": self.encoder}

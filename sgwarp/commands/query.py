@@ -8,6 +8,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Literal
 
+from sgwarp.commands.effects import LABELS, say_unused
 from sgwarp.commands.inputs_kept import LOG, keep_photographs
 from sgwarp.commands.options import SemanticsOptions, check_name, find_view, find_views, photograph, place_views
 from sgwarp.errors import InputError
@@ -72,6 +73,8 @@ class Query(SemanticsOptions):
             from sgwarp.visualization.pictures import heat_map, mark_pixel
 
             gaussians, semantics = self.load_both(log)
+            if semantics.labels is not None:
+                say_unused(self, ("encoder", "templates", "score", "canonical"), LABELS)
             predicted = self.load_predicted(gaussians, log)
             views = find_views(self.views, images=self.images)
             heat = self.out.with_name(f"{self.out.stem}_heat.png")

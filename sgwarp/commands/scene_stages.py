@@ -14,6 +14,7 @@ from typing import Any
 
 from sgwarp.cluster.listing import Scene
 from sgwarp.cluster.tasks import OUT, Stage
+from sgwarp.commands.effects import say_without_effect
 from sgwarp.commands.evaluate import Evaluate
 from sgwarp.commands.fit import Fit
 from sgwarp.commands.inputs_kept import guarded
@@ -136,6 +137,7 @@ def run_stage(name: str, arguments: Sequence[str]) -> None:
     command.command_line = shlex.join(["sgwarp", name, *arguments])
     _show_notices()
     with guarded(command):
+        say_without_effect(command)
         command.run()
 
 

@@ -7,6 +7,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Literal
 
+from sgwarp.commands.effects import LABELS, say_unused
 from sgwarp.commands.inputs_kept import LOG, keep_maps, keep_photographs
 from sgwarp.commands.options import SemanticsOptions, check_folder, find_views, photograph, place_views
 from sgwarp.errors import InputError
@@ -68,6 +69,8 @@ class Segment(SemanticsOptions):
             from sgwarp.querying.segmentation import segment_votes
 
             gaussians, semantics = self.load_both(log)
+            if semantics.labels is not None and classes is not None:
+                say_unused(self, ("encoder", "templates", "scoring", "temperature"), LABELS)
             predicted = self.load_predicted(gaussians, log)
             views = find_views(self.views, self.view, images=self.images)
             self._keep_inputs(views)
