@@ -64,7 +64,8 @@ MET = {
     "poses": {"every": "a.mp4"},
     "info": {},
     "convert": {"spz_version": "a.spz"},
-    "view": {**dict.fromkeys(("transform", "images"), "--views v"), **dict.fromkeys(("encoder", "min_weight"), "--semantics s")},
+    "view": dict.fromkeys(("transform", "images"), "--views v")
+    | dict.fromkeys(("encoder", "min_weight"), "--semantics s"),
 }  # fmt: skip
 UNMET = {
     "lift": {"cache_limit": "--cache none"},
