@@ -14,7 +14,8 @@ import json
 import subprocess
 import sys
 import tempfile
-from collections.abc import Callable
+import zipfile
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -63,6 +64,39 @@ def text_ply(folder: Path, size: int) -> Path:
     content.text = True
     content.write(str(folder / "text.ply"))
     return folder / "text.ply"
+
+
+def sog(folder: Path, size: int, degree: int) -> Path:
+    """Noise in every picture, as far as the format has room for it; with harmonics, from as many palettes as it has."""
+    each = 15.5 + 2 * (degree > 0)  # bytes of a Gaussian
+    palettes, width = 65536, {0: 0, 3: 15}[degree]
+    side = max(int(((size - 3 * palettes * width) / each if size > 10_000_000 else size / each) ** 0.5), 16)
+    rng, count = np.random.default_rng(0), side * side
+    book = np.linspace(-2, 2, 256).tolist()
+    meta: dict[str, Any] = {"version": 2, "count": count, "means": {"mins": [-1] * 3, "maxs": [1] * 3}}
+    meta |= {name: {"codebook": book} for name in ("scales", "sh0")} | {"quats": {}}
+    with zipfile.ZipFile(folder / "a.sog", "w") as archive:
+
+        def add(section: str, names: Sequence[str], height: int, columns: int, alpha: Any = 255) -> None:
+            meta[section]["files"] = [*meta[section].get("files", ()), *names]
+            for name in names:
+                pixels = rng.integers(0, 256, (height, columns, 4), dtype=np.uint8)
+                pixels[..., 3] = rng.integers(*alpha, (height, columns)) if isinstance(alpha, tuple) else alpha
+                if name == "shN_labels.webp":
+                    pixels[..., 0] = 0
+                _, data = cv2.imencode(".webp", pixels, [cv2.IMWRITE_WEBP_QUALITY, 101])  # above 100: lossless
+                archive.writestr(name, data.tobytes())
+
+        add("means", ("means_l.webp", "means_u.webp"), side, side)
+        add("scales", ("scales.webp",), side, side)
+        add("quats", ("quats.webp",), side, side, (252, 256))
+        add("sh0", ("sh0.webp",), side, side, (0, 256))
+        if degree:
+            meta["shN"] = {"count": palettes, "bands": degree, "codebook": book}
+            add("shN", ("shN_centroids.webp",), palettes // 64, 64 * width)
+            add("shN", ("shN_labels.webp",), side, side)
+        archive.writestr("meta.json", json.dumps(meta))
+    return folder / "a.sog"
 
 
 def colmap(folder: Path, size: int, suffix: str) -> Path:
@@ -146,6 +180,8 @@ CASES: dict[str, tuple[Write, Read]] = {
     "compressed PLY, degree 3": scene("a.compressed.ply", 3, 61),
     "compressed PLY, degree 0": scene("b.compressed.ply", 0, 16),
     "SPZ, degree 1": scene("a.spz", 1, 21),
+    "SOG, degree 3": (lambda folder, size: sog(folder, size, 3), load_gaussians),
+    "SOG, degree 0": (lambda folder, size: sog(folder, size, 0), load_gaussians),
     ".splat": scene("a.splat", 0, 32),
     "glTF, degree 1": scene("a.glb", 1, 92),
     "COLMAP's images.bin and the rest": (lambda folder, size: colmap(folder, size, "bin"), read_views),

@@ -69,6 +69,8 @@ def _run(argv: list[str]) -> int:
     except ImportError:
         return _fail("the command line needs tyro; run: pip install 'sgwarp[cli]'", 2)
     from sgwarp.commands import COMMANDS
+    from sgwarp.commands.effects import say_without_effect
+    from sgwarp.commands.inputs_kept import guarded
 
     description = f"Open-vocabulary understanding of 3D Gaussian Splatting scenes, version {__version__}."
     command = tyro.extras.subcommand_cli_from_dict(dict(COMMANDS), prog="sgwarp", description=description, args=argv)
@@ -76,7 +78,9 @@ def _run(argv: list[str]) -> int:
     command.command_line = shlex.join(["sgwarp", *argv])
     with _notices():
         try:
-            code = command.run()
+            with guarded(command):
+                say_without_effect(command)
+                code = command.run()
         except InputError as error:
             raise InputError(_as_option(str(error), vars(command))) from error
     return code or 0

@@ -24,6 +24,7 @@ from typing import TYPE_CHECKING, Any
 from sgwarp.errors import InputError
 from sgwarp.files import documents
 from sgwarp.files.atomic import atomic_path
+from sgwarp.files.inputs import own_files
 
 if TYPE_CHECKING:
     from sgwarp.cluster.tasks import Task
@@ -130,7 +131,8 @@ def _same_file(handle: int, path: Path) -> bool:
 def read_json(path: Path) -> dict[str, Any]:
     """The record in a file; empty if there is none, or none that can be read."""
     try:
-        record = documents.read_json(path)
+        with own_files():
+            record = documents.read_json(path)
     except InputError:
         return {}
     return record if isinstance(record, dict) else {}

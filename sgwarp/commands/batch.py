@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import os
 import secrets
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from pathlib import Path
@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, Any, Literal
 
 import tyro
 
+from sgwarp.commands.inputs_kept import LOG
 from sgwarp.commands.options import check_folder
 from sgwarp.errors import InputError
 from sgwarp.runs.log import RunLog
@@ -83,6 +84,10 @@ class Batch:
     """Largest resident memory that a scene may take [gigabytes]."""
 
     command_line: tyro.conf.Suppress[str] = ""
+
+    def written(self) -> Iterator[tuple[str, list[Path]]]:
+        folder = self.out / "shards" / self.shard.replace("/", "-of-") if self.shard is not None else self.out
+        yield "--out", [folder / name for name in ("summary.csv", "summary.png", LOG)]
 
     def run(self) -> int:
         """Returns the exit code."""

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -43,6 +44,9 @@ class Convert(Options):
     plain: bool = False
     """Leave out columns that are not those of a 3DGS scene, which some viewers refuse."""
 
+    def written(self) -> Iterator[tuple[str, list[Path]]]:
+        yield "out", [self.out]
+
     def run(self) -> None:
         check_folder("--out", self.out.parent)
         self.require_writable()
@@ -61,13 +65,11 @@ class Convert(Options):
         print(f"{len(gaussians)} Gaussians, {_size(before)} -> {_size(after)}; {log.summary()}")
 
     def require_writable(self) -> None:
-        """Refuse a name that no format has, or that of the input, before anything is read."""
+        """Refuse a name that no format has before anything is read."""
         from sgwarp.io.scenes import WRITTEN, find_writer
 
         if find_writer(self.out) is None:
             raise InputError(f"{self.out}: scenes are written as {WRITTEN}; change the name")
-        if self.out.exists() and self.scene.exists() and self.out.samefile(self.scene):
-            raise InputError(f"{self.out}: is the scene itself; choose another name")
 
     def _write(self, gaussians: Gaussians) -> None:
         from sgwarp.io.formats.axes import parse_axes

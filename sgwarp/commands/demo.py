@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from sgwarp.commands.inputs_kept import LOG
 from sgwarp.commands.options import Options, check_folder
 from sgwarp.runs.progress import show_progress
 
@@ -24,6 +26,11 @@ class Demo(Options):
 
     view: bool = False
     """Show the room in the browser while it is lifted, and the result until Ctrl-C."""
+
+    def written(self) -> Iterator[tuple[str, list[Path]]]:
+        from sgwarp.demo.run import PICTURES
+
+        yield "--out", [self.out / name for name in (*PICTURES, "report.md", LOG)]
 
     def run(self) -> None:
         check_folder("--out", self.out)

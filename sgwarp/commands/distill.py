@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
@@ -9,6 +10,7 @@ from typing import TYPE_CHECKING, Literal
 
 import tyro
 
+from sgwarp.commands.inputs_kept import LOG
 from sgwarp.commands.options import Options, check_name, require_no_lift
 from sgwarp.errors import InputError
 from sgwarp.runs.progress import show_progress
@@ -94,6 +96,12 @@ class Distill(Options):
 
     checkpoint: Path | None = None
     """Weights to start from: a network of ours, or a checkpoint of MinkowskiEngine, OpenScene or the paper."""
+
+    def written(self) -> Iterator[tuple[str, list[Path]]]:
+        from sgwarp.network.training.trainer import state_path
+
+        curves = [self.out.with_name(f"{self.out.with_suffix('').name}_curves{suffix}") for suffix in (".json", ".png")]
+        yield "--out", [self.out, state_path(self.out), *curves, self.out.parent / LOG]
 
     def run(self) -> None:
         check_name("--out", self.out, ".safetensors")

@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from sgwarp.commands.inputs_kept import keep_photographs
+from sgwarp.commands.inputs_kept import LOG, keep_photographs
 from sgwarp.commands.options import SceneOptions, check_name, find_view, find_views, load_on, place_views
 from sgwarp.errors import InputError
 
@@ -99,10 +99,12 @@ class Edit(SceneOptions):
     view: str | None = None
     """View to draw before and after from, to {out}.png; needs --views."""
 
+    def written(self) -> Iterator[tuple[str, list[Path]]]:
+        beside = [self.out.with_name(f"{self.out.stem}.ops.json"), self.out.parent / LOG]
+        yield "--out", [self.out, *beside, *([] if self.view is None else [self.out.with_name(f"{self.out.stem}.png")])]
+
     def run(self) -> None:
         check_name("--out", self.out, ".ply")
-        if self.out.resolve() == self.scene.resolve():
-            raise InputError(f"--out {self.out}: is the scene itself; choose another name")
         if self.view is not None and self.views is None:
             raise InputError(f"--view {self.view}: needs --views, the folder that holds it")
         if self.undo and self.script is None:

@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Literal
 
 import tyro
 
+from sgwarp.commands.inputs_kept import LOG
 from sgwarp.commands.options import Options, check_folder, notices_held_back
 from sgwarp.errors import InputError
 from sgwarp.runs.progress import show_progress
@@ -125,6 +127,11 @@ class Evaluate(Options):
 
     cache: str = ""
     """As for `sgwarp lift`."""
+
+    def written(self) -> Iterator[tuple[str, list[Path]]]:
+        names = [f"results.{kind}" for kind in ("md", "json", "tex")]
+        names += [] if self.ablate is None else ["ablation.json", "ablation.png"]
+        yield "--out", [self.out / name for name in (*names, LOG)]
 
     def run(self) -> int:
         """Returns the exit code, 1 if a scene failed."""

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import logging
 import math
+from collections.abc import Iterator
 from contextlib import ExitStack
 from dataclasses import asdict, dataclass
 from pathlib import Path
@@ -11,6 +12,7 @@ from typing import TYPE_CHECKING, Any, Literal
 
 import tyro
 
+from sgwarp.commands.inputs_kept import LOG
 from sgwarp.commands.options import Options, check_name, find_views, notices_held_back
 from sgwarp.commands.poses import find_poses
 from sgwarp.errors import InputError
@@ -122,6 +124,12 @@ class Fit(Options):
 
     view: bool = False
     """Show the scene in the browser while it is fitted, and the result until Ctrl-C."""
+
+    def written(self) -> Iterator[tuple[str, list[Path]]]:
+        name, stem, folder = self.out.name, self.out.stem, self.out.parent
+        names = [name, f"{name}.checkpoint", f"{stem}.held_out.jpg", f"{stem}.curve.png", LOG]
+        names += [f"{name}.refined/transforms.json"] * self.refine_poses
+        yield "--out", [folder / one for one in names]
 
     def run(self) -> None:
         with ExitStack() as stack:

@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
-from sgwarp.commands.inputs_kept import keep_maps, keep_photographs
+from sgwarp.commands.inputs_kept import LOG, keep_maps, keep_photographs
 from sgwarp.commands.options import (
     SceneOptions,
     check_folder,
@@ -85,6 +86,11 @@ class Instances(SceneOptions):
     render_out: Path | None = None
     """Folder for id maps {stem}.png, 16 bits, 0 = none or undecided, and pictures/{stem}.png with a legend."""
 
+    def written(self) -> Iterator[tuple[str, list[Path]]]:
+        yield "--out", [self.out, self.out.with_name(f"{self.out.stem}.table.json"), self.out.parent / LOG]
+        if self.ply is not None:
+            yield "--ply", [self.ply]
+
     def run(self) -> None:
         self._check()
         settings = self._settings()
@@ -128,8 +134,6 @@ class Instances(SceneOptions):
         require_no_lift(self.out)
         if self.ply is not None:
             check_name("--ply", self.ply, ".ply")
-            if self.ply.resolve() == self.scene.resolve():
-                raise InputError(f"--ply {self.ply}: is the scene itself; choose another name")
         if self.render_views is not None and self.render_out is None:
             raise InputError("--render-views: needs --render-out, the folder for the id maps")
         if self.render_out is not None:

@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from contextlib import ExitStack, suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
+from sgwarp.commands.effects import say_unused
+from sgwarp.commands.inputs_kept import LOG
 from sgwarp.commands.options import SceneOptions, check_name, find_views, place_views
 from sgwarp.errors import InputError
 from sgwarp.runs.progress import show_progress
@@ -16,6 +19,9 @@ if TYPE_CHECKING:
     from sgwarp.scene import Gaussians, Semantics, View
     from sgwarp.viewer.live import Live
     from sgwarp.viewer.workbench import Workbench
+
+OF_VIEWS = ("transform", "cache", "cache_limit", "mode", "tau", "border", "passes", "ridge", "iterations")
+OF_VIEWS += ("reliability", "fill", "share_of_views", "photographs", "deterministic", "images", "view")
 
 
 @dataclass(kw_only=True)
@@ -83,6 +89,9 @@ class Lift(SceneOptions):
     view: bool = False
     """Show the scene in the browser while it is lifted, and the result until Ctrl-C."""
 
+    def written(self) -> Iterator[tuple[str, list[Path]]]:
+        yield "--out", [self.out, self.out.parent / LOG]
+
     def run(self) -> None:
         check_name("--out", self.out, ".safetensors")
         with ExitStack() as stack:
@@ -102,6 +111,7 @@ class Lift(SceneOptions):
             if source.kind.fused:
                 from sgwarp.encoders.building import builder
 
+                say_unused(self, OF_VIEWS, f"{self.encoder} holds features of Gaussians, nothing is lifted")
                 semantics = builder(source.kind.fused)(source.argument, gaussians, source.options.get("space"))
                 log.error["coverage"] = semantics.coverage
                 notes: dict[str, Any] = {"encoder": self.encoder}

@@ -33,6 +33,13 @@ class Options:
 
     command_line: tyro.conf.Suppress[str] = field(default="", repr=False)
 
+    def written(self) -> Iterator[tuple[str, list[Path]]]:
+        """Options that name outputs, each with its files, as far as these are known before anything is read.
+
+        A command with such an option says so itself; `inputs_kept.guarded` asks.
+        """
+        yield from ()
+
     @contextmanager
     def logged(self, folder: Path) -> Iterator[RunLog]:
         """Yield the log of this run. If the block succeeds, `run.json` goes into `folder`, and to stdout two lines:
@@ -250,12 +257,14 @@ def require_no_lift(out: Path) -> None:
     Raises:
         InputError: `out` is such a file.
     """
+    from sgwarp.files.inputs import own_files
     from sgwarp.io.store import read_notes
 
     if not out.is_file():
         return
     try:
-        lifted = "network" not in read_notes(out)
+        with own_files():  # a file of the same name that `predict` wrote is replaced
+            lifted = "network" not in read_notes(out)
     except InputError:  # no semantics at all
         return
     if lifted:

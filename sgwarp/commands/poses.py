@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 import logging
+from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Literal
 
 import tyro
 
+from sgwarp.commands.inputs_kept import LOG
 from sgwarp.commands.options import Options, check_folder
 from sgwarp.errors import InputError
 from sgwarp.runs.progress import show_progress
@@ -46,6 +48,9 @@ class Poses(Options):
 
     seed: int = 0
     """Seed of everything random."""
+
+    def written(self) -> Iterator[tuple[str, list[Path]]]:
+        yield "--out", [self.out / name for name in ("sfm.json", "database.db", LOG)]
 
     def run(self) -> None:
         check_folder("--out", self.out)

@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Literal
 
-from sgwarp.commands.inputs_kept import keep_file
+from sgwarp.commands.inputs_kept import LOG
 from sgwarp.commands.options import SceneOptions, check_name, load_on, require_no_lift
 
 if TYPE_CHECKING:
@@ -41,10 +42,12 @@ class Predict(SceneOptions):
     space: str | None = None
     """Embedding space of a checkpoint, which its file does not store; its file name if not given."""
 
+    def written(self) -> Iterator[tuple[str, list[Path]]]:
+        yield "--out", [self.out, self.out.parent / LOG]
+
     def run(self) -> None:
         check_name("--out", self.out, ".safetensors")
         require_no_lift(self.out)
-        keep_file("--out", self.out, self.net)
         with self.logged(self.out.parent) as log:
             from sgwarp.io.store import save_semantics
 

@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Literal
 
-from sgwarp.commands.inputs_kept import keep_photographs
+from sgwarp.commands.effects import LABELS, say_unused
+from sgwarp.commands.inputs_kept import LOG, keep_photographs
 from sgwarp.commands.options import SemanticsOptions, check_name, find_view, find_views, photograph, place_views
 from sgwarp.errors import InputError
 
@@ -53,6 +55,10 @@ class Query(SemanticsOptions):
     images: str | None = None
     """Name of a COLMAP model's folder of photographs, if it is not `images` nor the only one that holds them."""
 
+    def written(self) -> Iterator[tuple[str, list[Path]]]:
+        heat = self.out.with_name(f"{self.out.stem}_heat.png")
+        yield "--out", [self.out, heat, self.out.parent / LOG]
+
     def run(self) -> None:
         check_name("--out", self.out, ".png")
         if not self.text.strip():
@@ -67,6 +73,8 @@ class Query(SemanticsOptions):
             from sgwarp.visualization.pictures import heat_map, mark_pixel
 
             gaussians, semantics = self.load_both(log)
+            if semantics.labels is not None:
+                say_unused(self, ("encoder", "templates", "score", "canonical"), LABELS)
             predicted = self.load_predicted(gaussians, log)
             views = find_views(self.views, images=self.images)
             heat = self.out.with_name(f"{self.out.stem}_heat.png")

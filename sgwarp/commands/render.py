@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Literal
 
-from sgwarp.commands.inputs_kept import keep_photographs
+from sgwarp.commands.inputs_kept import LOG, keep_photographs
 from sgwarp.commands.options import SceneOptions, check_folder, find_views, notices_held_back
 from sgwarp.errors import InputError
 from sgwarp.runs.progress import show_progress
@@ -52,6 +53,12 @@ class Render(SceneOptions):
 
     images: str | None = None
     """Name of a COLMAP model's folder of photographs, if it is not `images` nor the only one that holds them."""
+
+    def written(self) -> Iterator[tuple[str, list[Path]]]:
+        if self.out.suffix == ".png":
+            yield "--out", [self.out, self.out.with_suffix(".npy"), self.out.parent / LOG]
+        else:
+            yield "--out", [self.out / LOG]
 
     def run(self) -> None:
         folder = self.out.parent if self.out.suffix == ".png" else self.out
@@ -102,12 +109,22 @@ class Render(SceneOptions):
                 photographed = find_views(self.views, images=self.images)
         except InputError:
             photographed = views
+            self._keep_photographs_of(views)
         keep_photographs("--out", map(self._picture, views), photographed)
         drawn = {view.stem for view in views}
         compared = [view for view in photographed if view.stem in drawn] or views
         views, compared = (with_near_plane_of(group, gaussians) for group in (views, compared))
         matrix = find_placement(gaussians, self.scene, compared, self.transform)
         return views if matrix is None else moved_views(views, matrix)
+
+    def _keep_photographs_of(self, views: list[View]) -> None:
+        """Some photographs are missing, so that nobody says which files the others are: those beside which no log of an
+        earlier run lies, in the folder of the views."""
+        assert self.views is not None
+        for picture in map(self._picture, views):
+            inside = picture.exists() and picture.resolve().is_relative_to(self.views.resolve())
+            if inside and not (picture.parent / LOG).is_file():
+                raise InputError(f"--out {picture}: may be a photograph of --views; choose another place")
 
     def _write(self, path: Path, image: Tensor) -> list[str]:
         """The picture, and for depth the numbers; returns their paths."""

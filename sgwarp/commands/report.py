@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 
+from sgwarp.commands.inputs_kept import LOG
 from sgwarp.commands.options import SceneOptions, check_folder, find_views, place_views
 
 
@@ -42,6 +44,11 @@ class Report(SceneOptions):
 
     extremes: bool = True
     """Off: leave the extreme scenes out; they do not depend on the scene."""
+
+    def written(self) -> Iterator[tuple[str, list[Path]]]:
+        from sgwarp.evaluation.report.page import PLOT
+
+        yield "--out", [self.out / name for name in ("report.md", "report.json", PLOT, LOG)]
 
     def run(self) -> None:
         check_folder("--out", self.out)

@@ -14,8 +14,10 @@ from typing import Any
 
 from sgwarp.cluster.listing import Scene
 from sgwarp.cluster.tasks import OUT, Stage
+from sgwarp.commands.effects import say_without_effect
 from sgwarp.commands.evaluate import Evaluate
 from sgwarp.commands.fit import Fit
+from sgwarp.commands.inputs_kept import guarded
 from sgwarp.commands.instances import Instances
 from sgwarp.commands.lift import Lift
 from sgwarp.commands.options import Options
@@ -134,7 +136,9 @@ def run_stage(name: str, arguments: Sequence[str]) -> None:
         command.resume = command.out.with_name(f"{command.out.name}.checkpoint").is_file()
     command.command_line = shlex.join(["sgwarp", name, *arguments])
     _show_notices()
-    command.run()
+    with guarded(command):
+        say_without_effect(command)
+        command.run()
 
 
 def parse(name: str, arguments: Sequence[str]) -> Any:

@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Literal
 
-from sgwarp.commands.inputs_kept import keep_maps, keep_photographs
+from sgwarp.commands.effects import LABELS, say_unused
+from sgwarp.commands.inputs_kept import LOG, keep_maps, keep_photographs
 from sgwarp.commands.options import SemanticsOptions, check_folder, find_views, photograph, place_views
 from sgwarp.errors import InputError
 from sgwarp.runs.progress import show_progress
@@ -53,6 +55,9 @@ class Segment(SemanticsOptions):
     images: str | None = None
     """Name of a COLMAP model's folder of photographs, if it is not `images` nor the only one that holds them."""
 
+    def written(self) -> Iterator[tuple[str, list[Path]]]:
+        yield "--out", [self.out / LOG]
+
     def run(self) -> None:
         check_folder("--out", self.out)
         if not 0.0 <= self.unknown_below <= 1.0:
@@ -64,6 +69,8 @@ class Segment(SemanticsOptions):
             from sgwarp.querying.segmentation import segment_votes
 
             gaussians, semantics = self.load_both(log)
+            if semantics.labels is not None and classes is not None:
+                say_unused(self, ("encoder", "templates", "scoring", "temperature"), LABELS)
             predicted = self.load_predicted(gaussians, log)
             views = find_views(self.views, self.view, images=self.images)
             self._keep_inputs(views)

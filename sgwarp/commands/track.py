@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 import logging
+from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
 import tyro
 
+from sgwarp.commands.inputs_kept import LOG
 from sgwarp.commands.options import Options, check_folder
 from sgwarp.commands.segment import class_names
 from sgwarp.errors import InputError
@@ -107,6 +109,10 @@ class Track(Options):
 
     cache_limit: float = 10.0
     """As for `sgwarp lift`."""
+
+    def written(self) -> Iterator[tuple[str, list[Path]]]:
+        names = ("tracks.json", "state.pt", "contact_sheet.jpg", "video.mp4", "trajectories.png", LOG)
+        yield "--out", [self.out / name for name in names]
 
     def run(self) -> None:
         check_folder("--out", self.out)

@@ -29,6 +29,7 @@ from sgwarp.errors import InputError
 from sgwarp.files.arrays import read_arrays
 from sgwarp.files.atomic import TEMPORARY, atomic_path, remove_leftovers
 from sgwarp.files.documents import parse_json
+from sgwarp.files.inputs import own_files
 from sgwarp.scene import FeatureMap, View
 from sgwarp.version import __version__
 
@@ -214,7 +215,8 @@ def _read(path: Path, name: str) -> dict[str, NDArray[Any]] | None:
     if not path.is_file():
         return None
     try:
-        stored = read_arrays(path)
+        with own_files():
+            stored = read_arrays(path)
         unpack(stored)
         if _header(stored).get("name") == name:
             return stored

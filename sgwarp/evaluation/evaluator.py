@@ -21,6 +21,7 @@ from sgwarp.evaluation.cases import in_scene
 from sgwarp.evaluation.profiles.base import Profile
 from sgwarp.evaluation.results import FILE, SceneResult, read_result, write_result
 from sgwarp.evaluation.settings import Settings
+from sgwarp.files.inputs import require_no_inputs_in
 from sgwarp.runs.log import RunLog
 from sgwarp.runs.memory import peak, reset_peak
 from sgwarp.runs.progress import Report
@@ -123,6 +124,7 @@ def evaluate_scene(
     log, result = RunLog(device=settings.device), SceneResult(name)
     reset_peak()
     case = profile.make(scene, settings, profile.split, log)
+    require_no_inputs_in(folder)
     shutil.rmtree(folder, ignore_errors=True)
     folder.mkdir(parents=True, exist_ok=True)
     try:

@@ -12,6 +12,7 @@ from typing import Any
 from sgwarp.errors import InputError
 from sgwarp.files.atomic import atomic_path
 from sgwarp.files.documents import read_json
+from sgwarp.files.inputs import own_files
 
 FILE = "result.json"
 
@@ -63,7 +64,8 @@ def read_result(path: Path, identity: Mapping[str, Any]) -> SceneResult | None:
     if not path.is_file():
         return None
     try:
-        record = read_json(path)
+        with own_files():
+            record = read_json(path)
         if not isinstance(record, dict) or _text(record.get("identity")) != _text(dict(identity)):
             return None
         return SceneResult(**_numbers(record["result"]))

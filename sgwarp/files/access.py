@@ -9,6 +9,7 @@ from contextlib import contextmanager
 from typing import BinaryIO
 
 from sgwarp.errors import InputError
+from sgwarp.files.inputs import note_input
 
 
 @contextmanager
@@ -20,9 +21,11 @@ def reading(path: str | os.PathLike[str]) -> Iterator[None]:
     if "\0" in os.fspath(path):
         raise InputError(f"{path}: no file can have this name; check the path")
     try:
-        mode = os.stat(path).st_mode
-        if not stat.S_ISREG(mode) and not stat.S_ISDIR(mode):
+        found = os.stat(path)
+        if not stat.S_ISREG(found.st_mode) and not stat.S_ISDIR(found.st_mode):
             raise InputError(f"{path}: is a pipe or a device; copy what it gives into a file first")
+        if not stat.S_ISDIR(found.st_mode):
+            note_input(path, found)
         yield
     except FileNotFoundError:
         raise InputError(f"{path}: no such file; check the path") from None

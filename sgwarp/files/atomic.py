@@ -13,6 +13,7 @@ from contextlib import contextmanager, suppress
 from pathlib import Path
 
 from sgwarp.errors import InputError
+from sgwarp.files.inputs import note_output, require_no_input
 
 # Machine and process are part of a temporary name: so a later run knows that nobody writes it any more.
 TEMPORARY = re.compile(r"\..*\.([0-9a-f]{4})-([0-9]+)-[0-9a-f]{8}(\.[^.]*)?")
@@ -34,12 +35,13 @@ def atomic_path(path: str | os.PathLike[str], durable: bool = True) -> Iterator[
         durable: Wait until the disk holds the file before it takes its name, so that it is whole after a power cut.
 
     Raises:
-        InputError: `path` is a folder, or it cannot be written: no space, no permission, and whatever else the
-            operating system objects to inside the block.
+        InputError: `path` is a folder, an input of the command that runs, or it cannot be written: no space, no
+            permission, and whatever else the operating system objects to inside the block.
     """
     target = Path(os.path.realpath(path)) if os.path.islink(path) else Path(path)
     if target.is_dir():
         raise InputError(f"{target}: is a folder; give the name of a file")
+    require_no_input(target)
     # The dot hides a half-written file from shell patterns such as *.png.
     token = f"{_machine()}-{os.getpid()}-{secrets.token_hex(4)}"
     temporary = target.with_name(f".{target.stem[:80]}.{token}{target.suffix}")
@@ -56,6 +58,7 @@ def atomic_path(path: str | os.PathLike[str], durable: bool = True) -> Iterator[
         if durable:
             _flush(temporary)
         os.replace(temporary, target)
+        note_output(target)
     except BrokenPipeError:  # of a terminal or a pipe that the block wrote to, not of the file
         raise
     except OSError as error:

@@ -46,7 +46,7 @@ def read_pickle(stream: BinaryIO, table: Table, persistent: Callable[[Any], Any]
     """The object in a stream, which is left just behind it.
 
     Args:
-        stream: With read, readline and tell; a read past the end must not take memory (BytesIO, mmap).
+        stream: With read, readline and tell; a read past the end must not take memory (BytesIO).
         table: What stands in for which (module, name).
         persistent: Resolves a persistent id.
 

@@ -10,11 +10,10 @@ Source of the layout: torch/serialization.py and torch/_utils.py of PyTorch 2, r
 from __future__ import annotations
 
 import io
-import mmap
 import os
 import struct
 from collections.abc import Callable, Iterable
-from typing import Any
+from typing import Any, BinaryIO
 
 import torch
 from torch import Tensor
@@ -48,12 +47,8 @@ STORAGES = {
 Buffers = Callable[[str, int], memoryview]  # bytes of a storage by its key; the second number is how many are claimed
 
 
-def load_torch(path: str | os.PathLike[str], mapped: bool = False) -> Any:
+def load_torch(path: str | os.PathLike[str]) -> Any:
     """The content of a file of torch.save; tensors lie on the CPU.
-
-    Args:
-        path: The file.
-        mapped: Tensors lie in the file, whose pages are read when they are used; it must not be changed meanwhile.
 
     Raises:
         InputError: The file is missing, cut short, damaged, or was not written by torch.save.
@@ -64,9 +59,9 @@ def load_torch(path: str | os.PathLike[str], mapped: bool = False) -> Any:
         try:
             if head == ZIP_SIGNATURE:
                 with open_archive(path) as archive:
-                    return _from_archive(archive, _Pages(path, file.fileno(), size, mapped))
+                    return _from_archive(archive, _File(path, file, size))
             if head.startswith(PICKLE_SIGNATURE):
-                return _from_stream(_Pages(path, file.fileno(), size, mapped))
+                return _from_stream(_File(path, file, size))
         except UnpickleError as error:
             raise InputError(f"{path}: is not a file of plain tensors, or is damaged ({error})") from None
     what = "is empty" if not size else "is damaged, or was not written by torch.save"
@@ -88,27 +83,50 @@ def save_torch(path: str | os.PathLike[str], content: Any) -> None:
             raise error.__context__ from None
 
 
-class _Pages:
-    """A file's bytes, by position."""
+class _File:
+    """A file's bytes, by position or one after the other.
 
-    def __init__(self, path: str | os.PathLike[str], handle: int, size: int, mapped: bool) -> None:
-        self.path, self.size, self.mapped = path, size, mapped
-        # A private mapping: torch takes only memory that can be written to, and nothing reaches the file.
-        self.map = mmap.mmap(handle, 0, access=mmap.ACCESS_COPY)
+    They are read, not mapped: a file that shrinks under a mapping ends the process (SIGBUS).
+    """
+
+    def __init__(self, path: str | os.PathLike[str], file: BinaryIO, size: int) -> None:
+        self.path, self.size, self._file = path, size, file
 
     def take(self, start: int, count: int) -> memoryview:
-        """`count` bytes from `start` on.
+        """`count` bytes from `start` on; what is read next stays what it was.
 
         Raises:
             InputError: The file ends before.
         """
         if start + count > self.size:
-            raise InputError(f"{self.path}: is cut short ({self.size} bytes); copy or download it again")
-        part = memoryview(self.map)[start : start + count]
-        return part if self.mapped else memoryview(bytearray(part))
+            raise self._short()
+        part, place = memoryview(bytearray(count)), self._file.tell()
+        self._file.seek(start)
+        filled = self._file.readinto(part)  # type: ignore[attr-defined]
+        self._file.seek(place)
+        if filled != count:
+            raise self._short()
+        return part
+
+    def read(self, count: int = -1) -> bytes:
+        """Up to `count` bytes; a number beyond the end takes no memory."""
+        left = max(self.size - self._file.tell(), 0)
+        return self._file.read(left if count < 0 else min(count, left))
+
+    def readline(self) -> bytes:
+        return self._file.readline()
+
+    def tell(self) -> int:
+        return self._file.tell()
+
+    def seek(self, position: int) -> None:
+        self._file.seek(position)
+
+    def _short(self) -> InputError:
+        return InputError(f"{self.path}: is cut short ({self.size} bytes); copy or download it again")
 
 
-def _from_archive(archive: Archive, pages: _Pages) -> Any:
+def _from_archive(archive: Archive, pages: _File) -> Any:
     pickles = [name for name in archive.members if name.endswith("/data.pkl") or name == "data.pkl"]
     if len(pickles) != 1:
         raise InputError(f"{archive.path}: was not written by torch.save (holds no data.pkl); give a file of tensors")
@@ -128,9 +146,10 @@ def _from_archive(archive: Archive, pages: _Pages) -> Any:
     return _read(io.BytesIO(bytes(archive.read(pickles[0]))), buffer, archive.size)
 
 
-def _from_stream(pages: _Pages) -> Any:
+def _from_stream(pages: _File) -> Any:
     """The older container: magic number, version, machine, the object, keys of the storages, and those one by one."""
-    stream = pages.map
+    stream = pages
+    stream.seek(0)
 
     def nothing(key: str, claimed: int) -> memoryview:
         raise _LaterError(key, claimed)

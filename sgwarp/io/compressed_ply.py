@@ -22,6 +22,7 @@ import torch
 from numpy.typing import NDArray
 
 from sgwarp.errors import InputError
+from sgwarp.io.formats.packed import blocks
 from sgwarp.io.ply import (
     REST_COUNTS,
     Elements,
@@ -69,19 +70,25 @@ def gaussians_from_packed(path: str | os.PathLike[str], elements: Elements) -> G
     chunks = -(-count // CHUNK)
     if len(chunk) != chunks:
         raise InputError(f"{path}: {count} Gaussians need {chunks} chunks, element 'chunk' has {len(chunk)}")
-    position, rotation, scale, colour = (_words(vertex[name]) for name in PACKED)
-    rgba = _unpack(colour, BITS_RGBA)
-    rgb = rgba[:, :3]
-    if set(COLOUR_BOUNDS) <= set(chunk.dtype.names or ()):
-        rgb = _within(columns(path, chunk, COLOUR_BOUNDS), rgb)
-    means = _within(columns(path, chunk, BOUNDS), _unpack(position, BITS_XYZ))
-    log_scales = _within(columns(path, chunk, SCALE_BOUNDS), _unpack(scale, BITS_XYZ))
-    with np.errstate(over="ignore", invalid="ignore"):
-        scales = np.exp(log_scales).astype(np.float32)
-        dc = ((rgb - 0.5) / SH_C0).astype(np.float32)
-    sh = np.concatenate([dc[:, None, :], _unpack_sh(path, elements.get("sh"), count)], axis=1)
-    opacities = rgba[:, 3].astype(np.float32)
-    return build_gaussians(path, means.astype(np.float32), _unpack_rotation(rotation), scales, opacities, sh)
+    rest = _rest_names(path, elements.get("sh"), count)
+    bounded = set(COLOUR_BOUNDS) <= set(chunk.dtype.names or ())
+    means, scales = np.empty((2, count, 3), np.float32)
+    quats, opacities = np.empty((count, 4), np.float32), np.empty(count, np.float32)
+    sh = np.empty((count, 1 + len(rest) // 3, 3), np.float32)
+    for at in blocks(count):  # whole chunks
+        own = chunk[at.start // CHUNK : -(-at.stop // CHUNK)]
+        position, rotation, scale, colour = (_words(vertex[name][at]) for name in PACKED)
+        rgba = _unpack(colour, BITS_RGBA)
+        rgb = _within(columns(path, own, COLOUR_BOUNDS), rgba[:, :3]) if bounded else rgba[:, :3]
+        log_scales = _within(columns(path, own, SCALE_BOUNDS), _unpack(scale, BITS_XYZ))
+        with np.errstate(over="ignore", invalid="ignore"):
+            means[at] = _within(columns(path, own, BOUNDS), _unpack(position, BITS_XYZ))
+            scales[at] = np.exp(log_scales)
+            sh[at, 0] = (rgb - 0.5) / SH_C0
+        quats[at], opacities[at] = _unpack_rotation(rotation), rgba[:, 3]
+        if rest:
+            sh[at, 1:] = _unpack_sh(columns(path, elements["sh"][at], rest))
+    return build_gaussians(path, means, quats, scales, opacities, sh)
 
 
 def read_compressed_ply(path: str | os.PathLike[str]) -> Gaussians:
@@ -195,10 +202,10 @@ def _pack_rotation(quats: NDArray[np.float64]) -> NDArray[np.uint32]:
     return (largest.astype(np.uint32) << np.uint32(30)) | _pack(smaller / np.sqrt(2.0) + 0.5, (10, 10, 10))
 
 
-def _unpack_sh(path: str | os.PathLike[str], sh: NDArray[Any] | None, count: int) -> NDArray[np.float32]:
-    """Higher coefficients, float32 [N, K - 1, 3]; a byte stands for the middle of its interval, the ends for -4, 4."""
+def _rest_names(path: str | os.PathLike[str], sh: NDArray[Any] | None, count: int) -> tuple[str, ...]:
+    """Columns of the higher coefficients; none without the element `sh`."""
     if sh is None:
-        return np.zeros((count, 0, 3), dtype=np.float32)
+        return ()
     rest = len(sh.dtype.names or ())
     names = tuple(f"f_rest_{i}" for i in range(rest))
     if rest not in REST_COUNTS or set(names) != set(sh.dtype.names or ()) or len(sh) != count:
@@ -209,10 +216,15 @@ def _unpack_sh(path: str | os.PathLike[str], sh: NDArray[Any] | None, count: int
     wrong = [n for n in names if sh.dtype[n] != np.uint8]
     if wrong:
         raise InputError(f"{path}: column {wrong[0]} of element 'sh' must be uchar, is {sh.dtype[wrong[0]]}")
-    values = (columns(path, sh, names) + np.float32(0.5)) / 32 - 4
+    return names
+
+
+def _unpack_sh(levels: NDArray[np.float32]) -> NDArray[np.float32]:
+    """Higher coefficients, float32 [N, K - 1, 3]; a byte stands for the middle of its interval, the ends for -4, 4."""
+    values = (levels + np.float32(0.5)) / 32 - 4
     values[values == np.float32(0.5 / 32 - 4)] = -4
     values[values == np.float32(255.5 / 32 - 4)] = 4
-    return values.reshape(count, 3, rest // 3).transpose(0, 2, 1)
+    return values.reshape(len(values), 3, -1).transpose(0, 2, 1)
 
 
 def _within(bounds: NDArray[np.float32], fractions: NDArray[np.float64]) -> NDArray[np.float64]:

@@ -15,7 +15,7 @@ from sgwarp.errors import InputError
 from sgwarp.files.documents import read_json
 from sgwarp.io.colmap import find_model
 from sgwarp.io.stems import IMAGE_SUFFIXES
-from sgwarp.io.views import TRANSFORMS, load_views
+from sgwarp.io.views import TRANSFORMS, load_views, note_files
 from sgwarp.io.world_transforms import moved_views
 from sgwarp.scene import Camera, View
 from sgwarp.scene.extent import with_near_plane
@@ -107,6 +107,7 @@ class StillViews:
         for view in self.views:
             image = self._find(view.stem, frame) if self._photographs else None
             found.append(FrameView(replace(view, image_path=image), None, self._photographs and image is None))
+        note_files(one.view for one in found)
         return found
 
     def _find(self, stem: str, frame: int) -> Path | None:

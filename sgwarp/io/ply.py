@@ -18,7 +18,7 @@ import torch
 from numpy.typing import NDArray
 
 from sgwarp.errors import InputError
-from sgwarp.files.access import reading
+from sgwarp.files.access import open_input, reading
 from sgwarp.files.atomic import atomic_path
 from sgwarp.io.colors import rgb_names, unit_colors
 from sgwarp.io.formats.foreign import describe_ply
@@ -46,7 +46,7 @@ ROWS_PER_BLOCK = 16384  # a block of 62 columns fits the cache, so that rows are
 def read_elements(path: str | os.PathLike[str]) -> Elements:
     """Read any PLY file (ascii or binary, either byte order) into one structured array per element.
 
-    Binary elements without lists are memory-mapped, not loaded, unless comments or blank lines had to be left out.
+    The file is read, not mapped: one that shrinks under a mapping ends the process (SIGBUS).
 
     Raises:
         InputError: The file is missing, not a PLY file, or cut short.
@@ -84,7 +84,19 @@ def _parse(path: str | os.PathLike[str], source: str | io.BytesIO) -> Elements:
     except (plyfile.PlyParseError, ArithmeticError, LookupError, MemoryError, TypeError, ValueError) as error:
         reason = " ".join(str(error).split()) or type(error).__name__
         raise InputError(f"{path}: is not a valid PLY file ({reason})") from None
-    return {element.name: element.data for element in content.elements}
+    return {element.name: _loaded(path, element.data) for element in content.elements}
+
+
+def _loaded(path: str | os.PathLike[str], rows: NDArray[Any]) -> NDArray[Any]:
+    """Rows that plyfile has mapped, none of which has been looked at, read from where they lie."""
+    if not isinstance(rows, np.memmap):
+        return rows
+    with open_input(path) as file:
+        file.seek(rows.offset)
+        loaded = np.fromfile(file, rows.dtype, len(rows))
+    if len(loaded) < len(rows):
+        raise InputError(f"{path}: is cut short ({len(loaded)} of {len(rows)} rows); copy or download it again")
+    return loaded
 
 
 def write_elements(path: str | os.PathLike[str], elements: Elements, comment: str | None = None) -> None:

@@ -50,6 +50,8 @@ def check_ply(path: str | os.PathLike[str]) -> None:
     text, elements = _elements(head[:at])
     rest = size - end
     for element in elements:
+        if element.count < 0:  # without properties NumPy would divide by 0, which ends the process (SIGFPE)
+            raise InputError(f"{path}: its element '{element.name}' has {element.count} rows; the file is damaged")
         # In ascii a number takes a digit and a separator, the last one of the file only a digit.
         row = 2 * len(element.sizes) if text else sum(element.sizes)
         if element.count * row > rest + text:
@@ -109,4 +111,4 @@ def _elements(header: bytes) -> tuple[bool, list[_Element]]:
                 elements[-1].sizes.append(SIZES[words[1]])
         except (IndexError, KeyError, ValueError):
             break
-    return text, [element for element in elements if element.count > 0]
+    return text, elements

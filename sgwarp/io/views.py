@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 import os
+from collections.abc import Iterable
 from pathlib import Path
 
 from sgwarp.errors import InputError
+from sgwarp.files.inputs import note_input
 from sgwarp.io.colmap import find_model, read_colmap
 from sgwarp.io.foreign_captures import describe_capture, describe_list, describe_unread
 from sgwarp.io.transforms import read_transforms
@@ -57,6 +59,15 @@ def load_views(path: str | os.PathLike[str], image_folder: str | None = None, ph
     return _placed(path, read_colmap(path, image_folder, photographs))
 
 
+def note_files(views: Iterable[View]) -> None:
+    """Let no output take the place of what belongs to views, read or not."""
+    for view in views:
+        for path in (view.image_path, view.mask_path, view.depth_path):
+            if path is not None:
+                note_input(path)
+
+
 def _placed(source: Path, views: list[View]) -> list[View]:
     """Near the origin, and with near planes that fit their unit."""
+    note_files(views)
     return with_near_plane(moved_near_origin(source, views))

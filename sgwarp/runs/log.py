@@ -12,6 +12,7 @@ from pathlib import Path
 from typing import Any
 
 from sgwarp.files.atomic import atomic_path
+from sgwarp.files.inputs import require_apart
 from sgwarp.runs.progress import ShowProgress, hide_progress
 from sgwarp.version import __version__
 
@@ -60,7 +61,11 @@ class RunLog:
 
         On CUDA the block ends when its work is done; with `wait` off, when it is launched, and the next stage that
         waits is charged with the rest.
+
+        Raises:
+            InputError: What was read before is where an output would go.
         """
+        require_apart()
         start = time.perf_counter()
         try:
             yield

@@ -17,6 +17,7 @@ from sgwarp.scene.checks import float32, require, require_rows, version_of
 
 FIELDS = ("means", "quats", "scales", "opacities", "sh")
 SH_COUNTS = (1, 4, 9, 16)  # coefficients per color channel for degree 0 to 3
+ROWS = 1 << 16  # that are looked at at a time
 
 
 @dataclass(frozen=True, eq=False)
@@ -116,7 +117,11 @@ class Gaussians:
 
     def _find_finite(self) -> Tensor:
         flat = (self.means, self.quats, self.scales, self.opacities[:, None], self.sh.flatten(1))
-        return torch.stack([torch.isfinite(f).all(dim=1) for f in flat]).all(dim=0)
+        rows = torch.ones(len(self), dtype=torch.bool, device=self.device)
+        for start in range(0, len(self), ROWS):  # what lies between would be as large as the scene
+            part = slice(start, start + ROWS)
+            rows[part] = torch.stack([torch.isfinite(f[part]).all(dim=1) for f in flat]).all(dim=0)
+        return rows
 
     @property
     def colors_may_be_non_finite(self) -> bool:

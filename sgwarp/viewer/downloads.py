@@ -17,6 +17,7 @@ from sgwarp.apps.editing.script import save_script
 from sgwarp.errors import InputError
 from sgwarp.files.image_headers import image_size
 from sgwarp.files.images import read_rgb
+from sgwarp.files.videos import require_frames
 from sgwarp.io.scenes import save_gaussians
 from sgwarp.scene import Camera
 from sgwarp.viewer.modes import Shot, draw
@@ -99,12 +100,15 @@ def video_file(shot: Shot, keys: Sequence[Camera], progress: Progress | None = N
         fourcc = cv2.VideoWriter.fourcc(*"mp4v")
         writer = cv2.VideoWriter(str(path), fourcc, FRAMES_PER_SECOND, (width, height))
         if not writer.isOpened():
-            raise InputError("video: this OpenCV has no MPEG-4 encoder; save pictures instead")
+            raise InputError(
+                "path.mp4: cannot be written: the disk is full, or this OpenCV has no MPEG-4 encoder; save pictures"
+            )
         for done, camera in enumerate(cameras, start=1):
             writer.write(np.ascontiguousarray(draw(shot, camera).pixels[..., ::-1]))
             if progress is not None:
                 progress(done, len(cameras))
         writer.release()
+        require_frames("path.mp4", path, len(cameras))
 
     return _written("path.mp4", write)
 

@@ -121,7 +121,7 @@ def test_other_columns_stay_unless_plain(scene, tmp_path, capsys):
 @pytest.mark.parametrize(
     ("out", "more", "message"),
     [
-        ("a.ply", (), "is the scene itself; choose another name"),
+        ("a.ply", (), "is read by this command; choose another name"),
         ("b.obj", (), "b.obj: scenes are written as"),
         ("b.spz", ("--spz-version", 9), "version"),
         ("b.ply", ("--out-axes", "rrr"), "axes"),

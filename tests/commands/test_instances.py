@@ -153,7 +153,7 @@ def test_instances_refuses_bad_input(stage_files, found, tmp_path, capsys):
     masks = [*base, "--masks", f"files:{stage_files.labels}"]
     assert "needs --render-out" in fails(capsys, *masks, "--render-views", stage_files.views)
     assert "need --semantics" in fails(capsys, *masks, "--classes", "a,b")
-    assert "is the scene itself" in fails(capsys, *masks, "--ply", stage_files.scene)
+    assert "is read by this command" in fails(capsys, *masks, "--ply", stage_files.scene)
     assert "levels: expected" in fails(capsys, *masks, "--levels", "s,x")
     assert not list(tmp_path.iterdir())
 
@@ -255,7 +255,7 @@ def test_edit_refuses_bad_input(stage_files, found, edit, tmp_path, capsys):
     seen = ["--views", stage_files.views, "--view", "nowhere"]
     assert "has no view 'nowhere'" in fails(capsys, *edit, "--select", "all", "--scale", 2, *seen)
     itself = ["edit", stage_files.scene, "--out", stage_files.scene, "--select", "all", "--scale", 2]
-    assert "is the scene itself" in fails(capsys, *itself)
+    assert "is read by this command" in fails(capsys, *itself)
     other = tmp_path / "other.json"
     steps = [{"select": ["all"], "do": "scale", "factor": 2}]
     other.write_text(json.dumps({"format": "sgwarp-edit", "version": 1, "scene": "0" * 16, "steps": steps}))

@@ -3,8 +3,11 @@
 import base64
 import gc
 import json
+import os
 import random
 import signal
+import subprocess
+import sys
 from pathlib import Path
 
 import pytest
@@ -57,6 +60,19 @@ def test_what_was_found_stays_mended(pairs, alarm, number):
         assert alarm.check(reader, base64.b64decode(entry["file"]), alarm.Memory()) in ("read", "refused")
     finally:
         reader.file.write_bytes(original)
+
+
+@pytest.mark.slow
+def test_a_file_that_is_shortened_while_it_is_read():
+    """In place, by another process; a reader that maps its file would end this one with SIGBUS."""
+    root = Path(__file__).resolve().parents[2]
+    done = subprocess.run(
+        [sys.executable, Path(__file__).with_name("shrinking.py")],
+        env={**os.environ, "PYTHONPATH": str(root)}, capture_output=True, text=True, check=False,
+    )  # fmt: skip
+    assert done.returncode == 0, done.stdout[-2000:] + done.stderr[-2000:]
+    used, refused = (int(part.split()[0]) for part in done.stdout.splitlines()[-1].split(",")[:2])
+    assert min(used, refused) > 100
 
 
 def test_the_fuzzer_sees_what_is_wrong(tmp_path, alarm):

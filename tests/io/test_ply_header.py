@@ -39,6 +39,13 @@ def test_files_that_are_cut_short_are_refused_at_once(tmp_path, rows, body, form
     assert time.process_time() - began < 1
 
 
+@pytest.mark.parametrize("properties", ["", "property float x\n"])
+def test_fewer_than_no_rows_are_refused(tmp_path, properties):
+    """Without properties such an element ends the process in NumPy."""
+    with pytest.raises(InputError, match=r"a\.ply: its element 'vertex' has -1 rows; the file is damaged"):
+        check_ply(ply(tmp_path / "a.ply", -1, bytes(12), properties=properties))
+
+
 def test_a_header_without_end_is_refused_at_once(tmp_path):
     path = tmp_path / "a.ply"
     path.write_bytes(b"ply\n" + b"comment" * LONGEST)

@@ -13,6 +13,7 @@ import numpy as np
 from sgwarp.errors import InputError
 from sgwarp.files.atomic import atomic_path
 from sgwarp.files.images import read_rgb, write_rgb
+from sgwarp.files.videos import require_frames
 from sgwarp.visualization.pictures import Picture, class_colours, overlay, with_legend
 
 SHEET = 9  # frames on a contact sheet
@@ -97,13 +98,16 @@ def write_video(path: Path, pictures: Sequence[Path]) -> None:
     with atomic_path(path) as temporary:
         writer = cv2.VideoWriter(str(temporary), cv2.VideoWriter.fourcc(*"mp4v"), FRAMES_PER_SECOND, (width, height))
         if not writer.isOpened():
-            raise InputError(f"{path}: this OpenCV has no MPEG-4 encoder; leave the video out with --no-pictures")
+            raise InputError(
+                f"{path}: cannot be written: the disk is full, or this OpenCV has no MPEG-4 encoder (--no-pictures leaves it out)"
+            )
         for picture in pictures:
             board = np.full((height, width, 3), 255, np.uint8)
             pixels = read_rgb(picture)[:height, :width]
             board[: len(pixels), : pixels.shape[1]] = pixels
             writer.write(np.ascontiguousarray(board[:, :, ::-1]))
         writer.release()
+        require_frames(str(path), temporary, len(pictures))
 
 
 def write_trajectories(path: Path, tracks: dict[str, Any]) -> bool:

@@ -19,6 +19,7 @@ from sgwarp.apps.tracking.tracker import TrackedFrame, Tracker, count_frames, vi
 from sgwarp.files.atomic import atomic_path
 from sgwarp.files.documents import read_json
 from sgwarp.files.images import write_ids, write_rgb
+from sgwarp.files.inputs import own_files, require_no_inputs_in
 from sgwarp.io.moving_views import FrameView, MovingViews
 from sgwarp.io.sequences import GaussianSequence
 from sgwarp.rendering.renderer import render
@@ -183,6 +184,7 @@ def _finish(output: Output, total: int, log: RunLog) -> dict[str, Any]:
     """Gather the frames into tracks.json and draw the pictures; frames of an earlier, longer run go."""
     for path in output.folder.iterdir():
         if path.name.isdecimal() and int(path.name) >= total and (path / FRAME_FILE).is_file():
+            require_no_inputs_in(path)
             shutil.rmtree(path)
     rows = [_read_row(output.folder / f"{index:05d}" / FRAME_FILE) for index in range(total)]
     tracks = gather(rows)
@@ -206,7 +208,8 @@ def _draw(folder: Path, drawn: Sequence[Path], tracks: dict[str, Any], log: RunL
 
 
 def _read_row(path: Path) -> dict[str, Any]:
-    row: dict[str, Any] = read_json(path, "track again without --resume")
+    with own_files():
+        row: dict[str, Any] = read_json(path, "track again without --resume")
     return row
 
 

@@ -15,6 +15,7 @@ from sgwarp.apps.tracking.tracker import TrackedFrame, Tracker
 from sgwarp.errors import InputError
 from sgwarp.files.arrays import read_arrays
 from sgwarp.files.atomic import atomic_path
+from sgwarp.files.inputs import own_files
 from sgwarp.files.torch_files import load_torch, save_torch
 
 FORMAT = 1
@@ -44,7 +45,8 @@ def load_state(folder: Path, tracker: Tracker, settings: dict[str, Any]) -> tupl
     if not path.is_file():
         return None
     try:
-        content = load_torch(path)
+        with own_files():
+            content = load_torch(path)
         if content["format"] != FORMAT:
             raise InputError(f"{path}: is of format {content['format']}, this version knows {FORMAT}; start anew")
         frame, stored, channels = int(content["frame"]), content["settings"], content["channels"]

@@ -105,7 +105,7 @@ def read_checkpoint(path: str) -> dict[str, Tensor]:
         InputError: The file is missing, damaged, or holds no such tensors.
     """
     # Lightning keeps its settings beside the weights, as objects of its own; they come back inert.
-    content = load_torch(path, mapped=True)
+    content = load_torch(path)
     state = content.get("state_dict", content) if isinstance(content, Mapping) else {}
     if not isinstance(state, Mapping):
         state = {}

@@ -27,7 +27,7 @@ from sgwarp.files.access import read_bytes
 from sgwarp.files.archives import Archive, open_archive
 from sgwarp.files.documents import parse_json
 from sgwarp.io.formats.axes import PLY_AXES, change_axes
-from sgwarp.io.formats.packed import most_gaussians
+from sgwarp.io.formats.packed import blocks, most_gaussians
 from sgwarp.io.ply import build_gaussians
 from sgwarp.scene import Gaussians
 
@@ -142,17 +142,37 @@ def _decode(path: Path, data: bytes, fetch: Fetch, size: int) -> Gaussians:
     def pixels(name: str, least: int = count) -> NDArray[np.uint8]:
         return _picture(path, name, fetch(name), least).reshape(-1, 4)
 
-    low, high = (pixels(name)[:count, :3].astype(np.float32) for name in meta.files("means", 2))
+    higher = _Higher.of(path, meta, fetch, pixels)
+    means, scales = np.empty((2, count, 3), np.float32)
+    quats, opacities = np.empty((count, 4), np.float32), np.empty(count, np.float32)
+    sh = np.empty((count, 1 + higher.width, 3), np.float32)
+    low, high = (pixels(name) for name in meta.files("means", 2))
     mins, maxs = meta.numbers("means", "mins", 3), meta.numbers("means", "maxs", 3)
-    logs = mins + (maxs - mins) * ((high * 256 + low) / 65535)
+    for at in blocks(count):
+        logs = mins + (maxs - mins) * ((high[at, :3].astype(np.float32) * 256 + low[at, :3]) / 65535)
+        with np.errstate(over="ignore"):
+            means[at] = np.sign(logs) * np.expm1(np.abs(logs))
+    del low, high  # a picture is let go before the next one comes
     with np.errstate(over="ignore"):
-        means = np.sign(logs) * np.expm1(np.abs(logs))
-        scales = np.exp(meta.numbers("scales", "codebook", 256)[pixels(meta.files("scales", 1)[0])[:count, :3]])
-    quats = _quaternions(path, pixels(meta.files("quats", 1)[0])[:count])
-    rgba = pixels(meta.files("sh0", 1)[0])[:count]
-    dc = meta.numbers("sh0", "codebook", 256)[rgba[:, :3]]
-    sh = np.concatenate([dc[:, None], _higher(path, meta, fetch, count, pixels)], axis=1)
-    return build_gaussians(path, means, quats, scales, rgba[:, 3].astype(np.float32) / 255, sh)
+        sizes = np.exp(meta.numbers("scales", "codebook", 256))
+    _look_up(scales, sizes, pixels(meta.files("scales", 1)[0]))
+    rotations = pixels(meta.files("quats", 1)[0])
+    for at in blocks(count):
+        quats[at] = _quaternions(path, rotations[at])
+    del rotations
+    rgba = pixels(meta.files("sh0", 1)[0])
+    _look_up(sh[:, 0], meta.numbers("sh0", "codebook", 256), rgba)
+    for at in blocks(count):
+        opacities[at] = rgba[at, 3].astype(np.float32) / 255
+    del rgba
+    higher.fill(sh)
+    return build_gaussians(path, means, quats, scales, opacities, sh)
+
+
+def _look_up(values: NDArray[np.float32], codebook: NDArray[np.float32], rgba: NDArray[np.uint8]) -> None:
+    """Fill [N, 3] with what red, green and blue stand for."""
+    for at in blocks(len(values)):
+        values[at] = codebook[rgba[at, :3]]
 
 
 def _quaternions(path: Path, rgba: NDArray[np.uint8]) -> NDArray[np.float32]:
@@ -165,26 +185,42 @@ def _quaternions(path: Path, rgba: NDArray[np.uint8]) -> NDArray[np.float32]:
     return quats
 
 
-def _higher(
-    path: Path, meta: _Meta, fetch: Fetch, count: int, pixels: Callable[..., NDArray[np.uint8]]
-) -> NDArray[np.float32]:
-    """Coefficients above degree 0, float32 [N, K - 1, 3]."""
-    if "shN" not in meta.meta:
-        return np.zeros((count, 0, 3), np.float32)
-    section = meta.section("shN")
-    palettes = meta.whole(section.get("count"), "shN.count", 1, 65536)
-    width = COEFFICIENTS[meta.whole(section.get("bands"), "shN.bands", 1, 3)]
-    centroid_file, label_file = meta.files("shN", 2)
-    labels = pixels(label_file)[:count]
-    chosen = labels[:, 0].astype(np.intp) + 256 * labels[:, 1].astype(np.intp)
-    if int(chosen.max()) >= palettes:
-        raise InputError(f"{path}: a Gaussian has palette {int(chosen.max())} of {palettes}; it is damaged")
-    rows = -(-palettes // PALETTES_A_ROW)
-    picture = _picture(path, centroid_file, fetch(centroid_file), rows * PALETTES_A_ROW * width)
-    if picture.shape[1] != PALETTES_A_ROW * width or len(picture) < rows:
-        raise InputError(f"{path}: {centroid_file} is {picture.shape[1]} x {len(picture)}, too small for its palettes")
-    table = meta.numbers("shN", "codebook", 256)[picture[:rows, :, :3].reshape(-1, width, 3)]
-    return table[chosen]
+class _Higher:
+    """Coefficients above degree 0: palettes, and which of them each Gaussian has."""
+
+    def __init__(
+        self, path: Path, width: int = 0, table: NDArray[np.float32] | None = None, labels: Any = None
+    ) -> None:
+        self.path, self.width, self._table, self._labels = path, width, table, labels
+
+    @classmethod
+    def of(cls, path: Path, meta: _Meta, fetch: Fetch, pixels: Callable[[str], NDArray[np.uint8]]) -> _Higher:
+        if "shN" not in meta.meta:
+            return cls(path)
+        section = meta.section("shN")
+        palettes = meta.whole(section.get("count"), "shN.count", 1, 65536)
+        width = COEFFICIENTS[meta.whole(section.get("bands"), "shN.bands", 1, 3)]
+        centroid_file, label_file = meta.files("shN", 2)
+        rows = -(-palettes // PALETTES_A_ROW)
+        picture = _picture(path, centroid_file, fetch(centroid_file), rows * PALETTES_A_ROW * width)
+        if picture.shape[1] != PALETTES_A_ROW * width or len(picture) < rows:
+            raise InputError(
+                f"{path}: {centroid_file} is {picture.shape[1]} x {len(picture)}, too small for its palettes"
+            )
+        table = meta.numbers("shN", "codebook", 256)[picture[:rows, :, :3].reshape(-1, width, 3)]
+        return cls(path, width, table[:palettes], lambda: pixels(label_file))
+
+    def fill(self, sh: NDArray[np.float32]) -> None:
+        """Write them into [N, K, 3]."""
+        if self._table is None:
+            return
+        labels = self._labels()
+        for at in blocks(len(sh)):
+            chosen = labels[at, 0].astype(np.intp) + 256 * labels[at, 1].astype(np.intp)
+            if int(chosen.max()) >= len(self._table):
+                highest, count = int(chosen.max()), len(self._table)
+                raise InputError(f"{self.path}: a Gaussian has palette {highest} of {count}; it is damaged")
+            sh[at, 1:] = self._table[chosen]
 
 
 def _picture(path: Path, name: str, data: bytes, least: int) -> NDArray[np.uint8]:
@@ -206,7 +242,10 @@ def _picture(path: Path, name: str, data: bytes, least: int) -> NDArray[np.uint8
         raise InputError(f"{path}: {name[:80]} cannot be decoded; copy or download the scene again")
     if pixels.shape[2] == 3:  # opaque throughout
         pixels = np.concatenate([pixels, np.full((height, width, 1), 255, np.uint8)], axis=2)
-    return np.ascontiguousarray(pixels[:, :, [2, 1, 0, 3]])
+    red = pixels[:, :, 2].copy()
+    pixels[:, :, 2] = pixels[:, :, 0]
+    pixels[:, :, 0] = red
+    return pixels  # type: ignore[return-value]
 
 
 def webp_size(data: bytes) -> tuple[int, int] | None:

@@ -21,8 +21,9 @@ import logging
 import os
 import struct
 import zlib
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
-from typing import Any
+from typing import Any, Protocol
 
 import numpy as np
 import torch
@@ -31,9 +32,9 @@ from numpy.typing import NDArray
 from sgwarp.errors import InputError
 from sgwarp.files.access import read_bytes
 from sgwarp.files.atomic import atomic_path
-from sgwarp.io.formats.axes import PLY_AXES, SPZ_AXES, change_axes
-from sgwarp.io.formats.packed import most_gaussians
-from sgwarp.io.formats.zstd import compress_zstd, decompress_zstd
+from sgwarp.io.formats.axes import PLY_AXES, SPZ_AXES, change_axes, harmonic_signs, signs_between
+from sgwarp.io.formats.packed import blocks, most_gaussians
+from sgwarp.io.formats.zstd import ZstdStream, compress_zstd
 from sgwarp.io.ply import build_gaussians, drawn_rows, host_arrays
 from sgwarp.scene import SH_COUNTS, Gaussians
 
@@ -51,6 +52,7 @@ SH_DEGREES = (0, 3, 8, 15, 24)  # coefficients above degree 0, by degree
 OTHERS = np.array([[1, 2, 3], [0, 2, 3], [0, 1, 3], [0, 1, 2]])  # of x, y, z, w, without the largest
 MAX_POSITION = (1 << 23) - 1
 VERSIONS = (1, 2, 3, 4)
+PIECE = 1 << 16  # packed bytes given to the inflater at once, which copies what it has not used
 RECORD = struct.Struct("<II")  # type and bytes of an extension
 AXES_RECORD = 0xADBE0003
 AXES_NAMES = ("", "LDB", "RDB", "LUB", "RUB", "LDF", "RDF", "LUF", "RUF")  # by the number in that record
@@ -66,11 +68,62 @@ class Header:
     axes: str = SPZ_AXES
 
     @property
-    def sizes(self) -> tuple[int, ...]:
-        """Bytes of positions, opacities, colors, scales, rotations, harmonics."""
+    def widths(self) -> tuple[int, ...]:
+        """Bytes of one Gaussian in positions, opacities, colors, scales, rotations, harmonics."""
         position = 6 if self.version == 1 else 9
         rotation = 3 if self.version < 3 else 4
-        return tuple(self.count * width for width in (position, 1, 3, 3, rotation, 3 * SH_DEGREES[self.degree]))
+        return position, 1, 3, 3, rotation, 3 * SH_DEGREES[self.degree]
+
+    @property
+    def sizes(self) -> tuple[int, ...]:
+        """Bytes of these arrays."""
+        return tuple(self.count * width for width in self.widths)
+
+
+class Source(Protocol):
+    """What an array of the file comes from."""
+
+    def read(self, count: int) -> bytes:
+        """The next `count` bytes, all of them, or an InputError."""
+        ...
+
+
+class _GzipStream:
+    """The unpacked bytes of a gzip stream, some at a time."""
+
+    def __init__(self, path: str | os.PathLike[str], data: bytes) -> None:
+        self.path, self._data = path, memoryview(data)
+        self._inflater, self._at, self.given, self.total = zlib.decompressobj(wbits=31), 0, 0, 0
+
+    def read(self, count: int) -> bytes:
+        data = self.up_to(count)
+        if len(data) < count:
+            raise InputError(
+                f"{self.path}: is cut short: holds {self.given} of {self.total} bytes; copy or download it again"
+            )
+        return data
+
+    def up_to(self, count: int) -> bytes:
+        """As many of the next `count` bytes as there are.
+
+        Raises:
+            InputError: The stream is damaged.
+        """
+        pieces, missing = [], count
+        try:
+            while missing and not self._inflater.eof:
+                packed = self._inflater.unconsumed_tail or self._data[self._at : self._at + PIECE]
+                if not self._inflater.unconsumed_tail:
+                    self._at += len(packed)
+                piece = self._inflater.decompress(packed, missing)
+                if not packed and not piece:
+                    break
+                pieces.append(piece)
+                missing -= len(piece)
+        except zlib.error as error:
+            raise InputError(f"{self.path}: its gzip stream is damaged ({error}); copy or download it again") from None
+        self.given += count - missing
+        return b"".join(pieces)
 
 
 def read_spz(path: str | os.PathLike[str], axes: str | None = None) -> Gaussians:
@@ -90,40 +143,36 @@ def read_spz(path: str | os.PathLike[str], axes: str | None = None) -> Gaussians
 def gaussians_from_spz(path: str | os.PathLike[str], data: bytes, axes: str | None = None) -> Gaussians:
     """Decode the bytes of an SPZ scene; see `read_spz`."""
     if data[:2] == GZIP:
-        header, arrays = _read_gzip(path, data)
+        stream, header = _open_gzip(path, data)
+        gaussians = _decode(path, header, [stream] * 6, axes or header.axes)
+        stream.up_to(1)  # reaches the checksum
     elif data[:4] == MAGIC.to_bytes(4, "little"):
-        header, arrays = _read_streams(path, data)
+        header, streams = _open_streams(path, data)
+        gaussians = _decode(path, header, streams, axes or header.axes)
     else:
         raise InputError(f"{path}: is not an SPZ scene (neither gzip nor 'NGSP' at its start)")
     if header.flags & ANTIALIASED:
         logging.getLogger("sgwarp").warning("%s: was trained with antialiasing, which is not taken over", path)
-    return change_axes(_decode(path, header, arrays), axes or header.axes, PLY_AXES)
+    return gaussians
 
 
-def _read_gzip(path: str | os.PathLike[str], data: bytes) -> tuple[Header, list[bytes]]:
-    inflater = zlib.decompressobj(wbits=31)
-    try:
-        start = inflater.decompress(data, HEADER.size)
-        if len(start) < HEADER.size:
-            raise InputError(f"{path}: is cut short: holds no SPZ header; copy or download it again")
-        magic, version, count, degree, bits, flags, _ = HEADER.unpack(start)
-        if start[:3] == b"ply":
-            raise InputError(f"{path}: is a PLY file packed with gzip, which is not read; unpack it (gunzip)")
-        if magic != MAGIC or version not in VERSIONS[:3]:
-            raise InputError(f"{path}: is not an SPZ scene of version 1 to 3 (version {version})")
-        header = _checked(path, Header(version, count, degree, bits, flags))
-        _require_room(path, header, len(data))
-        total = sum(header.sizes)
-        body = inflater.decompress(inflater.unconsumed_tail, total)
-        inflater.decompress(inflater.unconsumed_tail, 1)  # reaches the checksum
-    except zlib.error as error:
-        raise InputError(f"{path}: its gzip stream is damaged ({error}); copy or download it again") from None
-    if len(body) < total:
-        raise InputError(f"{path}: is cut short: holds {len(body)} of {total} bytes; copy or download it again")
-    return header, _split(body, header.sizes)
+def _open_gzip(path: str | os.PathLike[str], data: bytes) -> tuple[_GzipStream, Header]:
+    stream = _GzipStream(path, data)
+    start = stream.up_to(HEADER.size)
+    if len(start) < HEADER.size:
+        raise InputError(f"{path}: is cut short: holds no SPZ header; copy or download it again")
+    magic, version, count, degree, bits, flags, _ = HEADER.unpack(start)
+    if start[:3] == b"ply":
+        raise InputError(f"{path}: is a PLY file packed with gzip, which is not read; unpack it (gunzip)")
+    if magic != MAGIC or version not in VERSIONS[:3]:
+        raise InputError(f"{path}: is not an SPZ scene of version 1 to 3 (version {version})")
+    header = _checked(path, Header(version, count, degree, bits, flags))
+    _require_room(path, header, len(data))
+    stream.given, stream.total = 0, sum(header.sizes)
+    return stream, header
 
 
-def _read_streams(path: str | os.PathLike[str], data: bytes) -> tuple[Header, list[bytes]]:
+def _open_streams(path: str | os.PathLike[str], data: bytes) -> tuple[Header, list[Source]]:
     if len(data) < HEADER_4.size:
         raise InputError(f"{path}: is cut short: holds no SPZ header; copy or download it again")
     _, version, count, degree, bits, flags, streams, table = HEADER_4.unpack_from(data)
@@ -138,14 +187,14 @@ def _read_streams(path: str | os.PathLike[str], data: bytes) -> tuple[Header, li
     _require_room(path, header, len(data))
     if header.flags & EXTENDED:
         header = replace(header, axes=_named_axes(path, data[HEADER_4.size : table]))
-    arrays = []
+    sources: list[Source] = []
     for index, size in enumerate(sizes):
         packed, unpacked = STREAM.unpack_from(data, table + index * STREAM.size)
         if unpacked != size or packed > len(data) - position:
             raise InputError(f"{path}: stream {index} does not have the size of {count} Gaussians; it is damaged")
-        arrays.append(decompress_zstd(path, memoryview(data)[position : position + packed], size))
+        sources.append(ZstdStream(path, memoryview(data)[position : position + packed], size))
         position += packed
-    return header, arrays + [b""] * (len(header.sizes) - len(arrays))
+    return header, sources
 
 
 def _named_axes(path: str | os.PathLike[str], records: bytes) -> str:
@@ -181,53 +230,62 @@ def _checked(path: str | os.PathLike[str], header: Header) -> Header:
     return header
 
 
-def _split(data: bytes, sizes: tuple[int, ...]) -> list[bytes]:
-    view, arrays, position = memoryview(data), [], 0
-    for size in sizes:
-        arrays.append(view[position : position + size])
-        position += size
-    return arrays  # type: ignore[return-value]
-
-
-def _decode(path: str | os.PathLike[str], header: Header, arrays: list[bytes]) -> Gaussians:
+def _decode(path: str | os.PathLike[str], header: Header, sources: Sequence[Source], axes: str) -> Gaussians:
+    """The scene in the axes of PLY files, each array filled block by block."""
     n = header.count
-    positions, opacities, colors, scales, rotations, harmonics = (np.frombuffer(a, np.uint8) for a in arrays)
-    if header.version == 1:
-        means = positions.view("<f2").astype(np.float32).reshape(n, 3)
-    else:
-        means = _from_24_bits(positions).reshape(n, 3) * np.float32(2.0**-header.fraction_bits)
-    unpack = _from_bytes if header.version < 3 else _from_words
-    dc = (colors.reshape(n, 1, 3).astype(np.float32) / 255 - np.float32(0.5)) / np.float32(COLOR_SCALE)
-    rest = harmonics.reshape(n, -1, 3)[:, : SH_COUNTS[-1] - 1]
+    x, y, z = signs = signs_between(axes, PLY_AXES)
     if header.degree > 3:
         logging.getLogger("sgwarp").warning("%s: harmonics of degree 4 are left out, up to 3 are kept", path)
-    sh = np.concatenate([dc, rest.astype(np.float32) / 128 - 1], axis=1)
-    return build_gaussians(
-        path,
-        means,
-        unpack(rotations),
-        np.exp(scales.reshape(n, 3).astype(np.float32) / 16 - 10),
-        opacities.astype(np.float32) / 255,
-        sh,
-    )
+    higher = min(SH_DEGREES[header.degree], SH_COUNTS[-1] - 1)
+    means, scales = np.empty((2, n, 3), np.float32)
+    quats, opacities = np.empty((n, 4), np.float32), np.empty(n, np.float32)
+    sh = np.empty((n, 1 + higher, 3), np.float32)
+
+    def rows(index: int) -> Iterator[tuple[slice, NDArray[np.uint8]]]:
+        """Bytes of an array, uint8 [rows, width], in the order of the file."""
+        width = header.widths[index]
+        for at in blocks(n) if width else ():
+            data = sources[index].read((at.stop - at.start) * width)
+            yield at, np.frombuffer(data, np.uint8).reshape(-1, width)
+
+    for at, values in rows(0):
+        if header.version == 1:
+            means[at] = values.view("<f2")
+        else:
+            means[at] = _from_24_bits(values).reshape(-1, 3) * np.float32(2.0**-header.fraction_bits)
+        means[at] *= np.array(signs, np.float32)
+    for at, values in rows(1):
+        opacities[at] = values[:, 0].astype(np.float32) / 255
+    for at, values in rows(2):
+        sh[at, 0] = (values.astype(np.float32) / 255 - np.float32(0.5)) / np.float32(COLOR_SCALE)
+    for at, values in rows(3):
+        scales[at] = np.exp(values.astype(np.float32) / 16 - 10)
+    for at, values in rows(4):
+        quats[at] = _from_bytes(values) if header.version < 3 else _from_words(values)
+        quats[at, 1:] *= np.array([y * z, x * z, x * y], np.float32)  # as `change_axes`
+    turned = harmonic_signs(signs, torch.from_numpy(sh)).numpy()[1:, None]
+    for at, values in rows(5):
+        sh[at, 1:] = values.reshape(len(values), -1, 3)[:, :higher].astype(np.float32) / 128 - 1
+        sh[at, 1:] *= turned
+    return build_gaussians(path, means, quats, scales, opacities, sh)
 
 
 def _from_24_bits(values: NDArray[np.uint8]) -> NDArray[np.float32]:
-    wide = np.zeros((len(values) // 3, 4), np.uint8)
+    wide = np.zeros((values.size // 3, 4), np.uint8)
     wide[:, 1:] = values.reshape(-1, 3)
     return (wide.view("<i4")[:, 0] >> 8).astype(np.float32)  # the shift keeps the sign
 
 
 def _from_bytes(values: NDArray[np.uint8]) -> NDArray[np.float32]:
     """Rotations (w, x, y, z) of versions 1 and 2."""
-    xyz = values.reshape(-1, 3).astype(np.float32) / np.float32(127.5) - 1
+    xyz = values.astype(np.float32) / np.float32(127.5) - 1
     w = np.sqrt(np.maximum(1 - (xyz**2).sum(axis=1, keepdims=True), 0))
     return np.concatenate([w, xyz], axis=1)
 
 
 def _from_words(values: NDArray[np.uint8]) -> NDArray[np.float32]:
     """Rotations (w, x, y, z) of versions 3 and 4."""
-    words = values.view("<u4").astype(np.uint32)
+    words = values.view("<u4")[:, 0].astype(np.uint32)
     largest = words >> np.uint32(30)
     fields = np.stack([words >> np.uint32(shift) for shift in (20, 10, 0)], axis=1) & np.uint32(1023)
     magnitudes = (fields & 511).astype(np.float32) * np.float32(np.sqrt(0.5) / 511)

@@ -19,6 +19,7 @@ import torch
 from torch import Tensor
 
 from sgwarp.errors import InputError
+from sgwarp.files.inputs import own_files
 from sgwarp.files.torch_files import load_torch, save_torch
 from sgwarp.metrics.segmentation import ConfusionMatrix
 from sgwarp.network.checkpoint import load_into, read_weights
@@ -329,7 +330,8 @@ class _Run:
             InputError: The file is no such state, or was written with other settings.
         """
         try:
-            content = load_torch(path)
+            with own_files():
+                content = load_torch(path)
             stored: dict[str, Any] = content["settings"]
             mine = self._signature()
             changed = [name for name in mine if mine[name] != stored.get(name)]

@@ -13,6 +13,7 @@ import torch
 from torch import Tensor
 
 from sgwarp.errors import InputError
+from sgwarp.files.inputs import own_files
 from sgwarp.files.torch_files import load_torch, save_torch
 from sgwarp.reconstruction.fitting.photographs import Photograph
 from sgwarp.reconstruction.fitting.settings import FitSettings
@@ -73,7 +74,8 @@ class Checkpoint:
             InputError: The file is missing or damaged, or belongs to another run.
         """
         try:
-            content = load_torch(path)
+            with own_files():
+                content = load_torch(path)
         except InputError:
             if not path.is_file():
                 raise

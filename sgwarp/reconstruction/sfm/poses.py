@@ -18,6 +18,7 @@ from sgwarp.files.access import reading
 from sgwarp.files.atomic import atomic_path
 from sgwarp.files.documents import read_json
 from sgwarp.files.images import read_size
+from sgwarp.files.inputs import note_input, own_files
 from sgwarp.io.foreign_captures import describe_unread
 from sgwarp.io.photographs import refuse_panorama
 from sgwarp.io.stems import IMAGE_ENDINGS, is_image_name
@@ -33,6 +34,7 @@ from sgwarp.runs.progress import Report
 
 logger = logging.getLogger("sgwarp")
 MODEL = Path("sparse") / "0"
+MAPPING, WHOLE = "mapping", "whole"  # where COLMAP works, and where the model is written
 NOTES = "sfm.json"
 NOT_COLMAP = (".webp",)
 LEAST_PHOTOGRAPHS = 3
@@ -128,6 +130,7 @@ def estimate_poses(
     require_photographs(folder, names, LEAST_PHOTOGRAPHS)
     if unread := describe_unread(folder):
         logger.warning("%s: %s", folder, unread)
+    _keep_photographs(folder, names, out)
     out.mkdir(parents=True, exist_ok=True)
     own = _fingerprint(folder, names, settings)
     known = _read_notes(out)
@@ -160,6 +163,20 @@ def estimate_poses(
     return found
 
 
+def _keep_photographs(folder: Path, names: Sequence[str], out: Path) -> None:
+    """Refuse photographs that lie in one of the folders of `out` that are removed before they are written.
+
+    Raises:
+        InputError: One does.
+    """
+    removed = [(out / name).resolve() for name in (MAPPING, WHOLE, MODEL)]
+    for name in names:
+        note_input(folder / name)
+        path = (folder / name).resolve()
+        if any(path.is_relative_to(place) for place in removed):
+            raise InputError(f"{folder / name}: would be removed by the results, which go there; choose another --out")
+
+
 def _why_unreadable(path: Path) -> str | None:
     """Why COLMAP cannot read a photograph, or None if it can."""
     if path.suffix.lower() in NOT_COLMAP:
@@ -180,7 +197,7 @@ def _map(database: Path, folder: Path, out: Path, settings: SfmSettings, count: 
     options = require_pycolmap().IncrementalPipelineOptions()
     options.random_seed, options.num_threads = settings.seed, settings.threads
     options.min_model_size = LEAST_PHOTOGRAPHS
-    work = out / "mapping"
+    work = out / MAPPING
     models = _attempt(database, folder, work, options, count, report)
     if not models:
         options.mapper.init_min_tri_angle = LEAST_ANGLE
@@ -249,7 +266,7 @@ def _reasons(
 
 def _keep(model: Any, folder: Path, out: Path) -> None:
     """Write the model whole or not at all, and link the photographs."""
-    whole, target = out / "whole", out / MODEL
+    whole, target = out / WHOLE, out / MODEL
     shutil.rmtree(whole, ignore_errors=True)
     whole.mkdir()
     model.write_binary(str(whole))
@@ -279,7 +296,8 @@ def _fingerprint(folder: Path, names: Sequence[str], settings: SfmSettings) -> s
 
 def _read_notes(out: Path) -> dict[str, Any]:
     try:
-        notes = read_json(out / NOTES)
+        with own_files():
+            notes = read_json(out / NOTES)
     except InputError:
         return {}
     return notes if isinstance(notes, dict) else {}
