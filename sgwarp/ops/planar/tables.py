@@ -101,6 +101,7 @@ class ProjectTable(torch.autograd.Function):
             empty = torch.empty((0,) * dims, dtype=dtype, device=means.device)
             values = empty if gradient is None else gradient.to(dtype).contiguous()
             inputs.append(view(values, wp.float64 if double else wp.float32))
+        inputs.append(request.settings.min_area_ratio)
         launch_plain(kernels.gather_moments, len(index), inputs, [view(sums, wp.float32)], device=means.device)
         opacities = request.opacities if len(request.opacities) else means.new_ones(len(means))
         gaussians = Gaussians.unchecked(means, quats, scales, opacities, means.new_zeros(len(means), 1, 3))
