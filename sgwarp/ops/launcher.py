@@ -206,8 +206,8 @@ _compilers: dict[str, ThreadPoolExecutor] = {}  # a thread for each set of compi
 def load_together(kernels: Sequence[wp.Kernel]) -> None:
     """Load the modules of these kernels on the CPU, side by side; what is not in the cache is compiled.
 
-    Modules of the same compiler options are loaded by one thread, which is kept: Warp compiles its headers once for each
-    thread and set of options, and that takes longer than several modules. The second time this costs nothing.
+    Modules of the same compiler options are loaded by one thread, which is kept: Warp compiles its headers once for
+    each thread and set of options, and that takes longer than several modules. The second time this costs nothing.
     """
     unseen = list({k.module.name: k.module for k in kernels if k.module.name not in _loaded}.values())
     if not unseen:

@@ -341,9 +341,7 @@ def test_the_antialiasing_of_inria_against_the_oracle(make_scene, pretended_cuda
         mine[0], None, mine[3][:, None], shs=mine[4], scales=mine[2], rotations=mine[1]
     )
     image = image.permute(1, 2, 0)
-    torch.testing.assert_close(
-        image.detach().cpu().double()[clear], wanted.features.detach()[clear], rtol=0, atol=2e-5
-    )
+    torch.testing.assert_close(image.detach().cpu().double()[clear], wanted.features.detach()[clear], rtol=0, atol=2e-5)
     (image * noise.to("cuda")).sum().backward()
     (wanted.features * noise.double()).sum().backward()
     for name, got, want in zip(("means", "quats", "scales", "opacities", "sh"), mine, exact, strict=True):

@@ -79,7 +79,7 @@ def test_tables_of_kernels_are_those_of_torch(scene, compensated):
 
 
 def test_a_compensation_that_is_held_has_no_gradient(make_scene):
-    """Points and lines without area among others, against float64 in torch: their opacities are held at half a percent."""
+    """Points and lines without area among others, whose opacities are held at half a percent; float64 in torch."""
     _, gaussians, camera = make_scene("random_cloud")
     count = len(gaussians)
     scales = gaussians.scales.clone()
