@@ -337,6 +337,9 @@ class _Functions(TorchFunctionMode):
             if func in (torch.Tensor.tolist, torch.Tensor.__repr__):
                 self.pretended.wait(func.__name__)
                 return func(plain(args[0].detach()))
+            if func is torch.Tensor.__format__:
+                self.pretended.wait("__format__")
+                return func(plain(args[0].detach()), *args[1:])
             if func is torch.Tensor.new_tensor:
                 return self._moved(torch.tensor(*args[1:], **({"dtype": args[0].dtype} | kwargs)), "cuda", {})
             if func is torch.Tensor.__deepcopy__:
