@@ -46,10 +46,17 @@ def test_files_are_never_kept(made):
 
 
 def test_a_block_forgets_what_it_kept(made):
-    with pytest.raises(KeyError), registry.kept_encoders():
-        first = registry.make_encoder("conse")
-        assert registry.make_encoder("conse") is first
-        raise KeyError
+    first = None
+
+    def fail():
+        nonlocal first
+        with registry.kept_encoders():
+            first = registry.make_encoder("conse")
+            assert registry.make_encoder("conse") is first
+            raise KeyError
+
+    with pytest.raises(KeyError):
+        fail()
     assert registry.make_encoder("conse") is not first
     registry.keep_encoders()
     first = registry.make_encoder("conse")
