@@ -21,6 +21,7 @@ from sgwarp.ops.splatting.backward import SplatGradients
 from sgwarp.ops.splatting.forward import LANE
 from sgwarp.ops.splatting.settings import RasterSettings
 from sgwarp.scene import Camera, Gaussians
+from sgwarp.scene.checks import require_cameras
 
 if TYPE_CHECKING:
     from sgwarp.ops.planar.projection import ProjectionSettings
@@ -49,12 +50,18 @@ class TableRequest:
 
 
 def read_camera(world_to_camera: Tensor, K: Tensor, width: int, height: int, near: float, far: float) -> Camera | None:
-    """The camera on the host, for which it waits once; None if it is none that the kernels know."""
+    """The camera on the host, for which it waits once; None if it is none that the kernels know.
+
+    Raises:
+        InputError: It sees nothing at all.
+    """
     pose, intrinsics = (t.detach().to(torch.float64).flatten() for t in (world_to_camera, K))
     if pose.device == intrinsics.device:
         pose, intrinsics = torch.cat([pose, intrinsics]).cpu().split([16, 9])
+    pose, intrinsics = pose.cpu().view(4, 4), intrinsics.cpu().view(3, 3)
+    require_cameras(pose, intrinsics)
     try:
-        return Camera(intrinsics.cpu().view(3, 3), pose.cpu().view(4, 4), width, height, near, far)
+        return Camera(intrinsics, pose, width, height, near, far)
     except InputError:
         return None
 
