@@ -52,6 +52,8 @@ class Subject:
 
 def subjects() -> list[Subject]:
     """The kernels of a rendering, a training step, a lift, and the network on voxels."""
+    import warp as wp
+
     from sgwarp.kernels.compositing import block, block_backward
     from sgwarp.kernels.contributors import block as contributors
     from sgwarp.kernels.fitting import adam, adam_elements, photometric_block
@@ -66,6 +68,9 @@ def subjects() -> list[Subject]:
 
     def lift(wide: bool) -> Callable[[], Any]:
         return lambda: lifting.make_lift_dense_block(False, False, wide)
+
+    def single(make: Callable[..., Any]) -> Callable[[], Any]:
+        return lambda: make(wp.float32, wp.float32)
 
     alphas, replayed = ("MUFU.EX2", 64), ("MUFU.EX2", 16)
     return [
@@ -90,12 +95,12 @@ def subjects() -> list[Subject]:
         Subject("count steps", lambda: adam.count_steps),
         Subject("Adam", lambda: adam_elements.update_elements, items="parameter"),
         Subject("kernel map", lambda: voxels.tabulate_neighbors, items="offset and voxel"),
-        Subject("convolution, statistics", lambda: convolution_block.convolve_blocks, items="16 sums"),
-        Subject("layer in inference", lambda: convolution_block.convolve_and_finish_blocks, items="16 sums"),
-        Subject("backward, convolution", lambda: convolution_block.convolve_backward_blocks, items="16 or 4 sums"),
-        Subject("normalize", lambda: normalization_block.normalize_elements, items="element"),
-        Subject("backward, sums", lambda: normalization_block.sum_normalized_blocks, items="share of a channel"),
-        Subject("backward, normalize", lambda: normalization_block.normalize_backward_elements, items="element"),
+        Subject("convolution, statistics", single(convolution_block.make_convolve_blocks), items="16 sums"),
+        Subject("layer in inference", single(convolution_block.make_convolve_and_finish_blocks), items="16 sums"),
+        Subject("backward, convolution", single(convolution_block.make_convolve_backward_blocks), items="16 or 4 sums"),
+        Subject("normalize", single(normalization_block.make_normalize_elements), items="element"),
+        Subject("backward, sums", single(normalization_block.make_sum_normalized_blocks), items="share of a channel"),
+        Subject("backward, normalize", single(normalization_block.make_normalize_backward_elements), items="element"),
     ]
 
 

@@ -80,6 +80,32 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
     _slow_tests.mark(items)
 
 
+@pytest.fixture
+def modules(monkeypatch: pytest.MonkeyPatch) -> tuple[set[str], set[str]]:
+    """Names of kernel modules that are loaded together from now on, and of those whose kernels are launched."""
+    import warp as wp
+
+    from sgwarp.ops import launcher
+
+    loaded: set[str] = set()
+    launched: set[str] = set()
+    load, launch = wp.force_load, wp.launch
+
+    def spy_on_loading(device, *, modules, **options):
+        loaded.update(module.name for module in modules)
+        load(device, modules=modules, **options)
+
+    def spy_on_launching(kernel, *arguments, **options):
+        launched.add(kernel.module.name)
+        return launch(kernel, *arguments, **options)
+
+    monkeypatch.setattr(wp, "force_load", spy_on_loading)
+    monkeypatch.setattr(wp, "launch", spy_on_launching)
+    monkeypatch.setattr(launcher, "_loaded", set())
+    monkeypatch.setattr(launcher, "_thread_count", 2)
+    return loaded, launched
+
+
 def pytest_configure(config: pytest.Config) -> None:
     if config.getoption("--record-slow"):
         config.pluginmanager.register(_slow_tests.Recorder())

@@ -13,6 +13,7 @@ import functools
 import importlib
 import os
 from collections.abc import Callable
+from types import ModuleType
 from typing import Any
 
 import pytest
@@ -31,6 +32,7 @@ OPERATIONS = {
     "sgwarp.ops.planar.projection": ("project_splats",),
     "sgwarp.ops.planar.pixel_lists": ("contributors_in_range", "composite_pairs"),
     "sgwarp.ops.sparse.convolution": ("sparse_conv",),
+    "sgwarp.ops.sparse.normalization": ("convolve_and_normalize",),
     "sgwarp.ops.sparse.voxels": ("pack_voxels", "unpack_voxels", "key_points", "coarsen", "kernel_map"),
     "sgwarp.ops.adam": ("count_steps", "update", "note_gradients", "add_noise"),
     "sgwarp.ops.photometric": ("photometric_loss",),
@@ -49,10 +51,13 @@ OPERATIONS = {
     ),
     "sgwarp.compat.inria": ("dist2",),
     "sgwarp.rendering.renderer": ("render",),
+    "sgwarp.rendering.strongest": ("render_strongest",),
+    "sgwarp.querying.scoring": ("score_texts", "best_texts"),
     "sgwarp.querying.segmentation": ("segment", "localize", "splat_scores", "segment_votes"),
-    "sgwarp.querying.scores": ("query", "relevancy"),
+    "sgwarp.querying.scores": ("query", "relevancy", "evidence", "standardise"),
     "sgwarp.network.inputs": ("voxelize", "input_features"),
 }
+BY_OTHER_NAMES = {"sgwarp", "sgwarp.compat.gsplat", "sgwarp.compat.inria"}  # modules that hand on what others define
 ON_THE_HOST = {"Camera", "View", "SplatJob"}
 _busy = False
 
@@ -100,21 +105,42 @@ def on_device(operation: Callable[..., Any]) -> Callable[..., Any]:
             _busy = False
         with torch.no_grad():
             for mine, moved in there.values():
-                if not mine.requires_grad and not mine.is_inference():
+                changed = not (mine.requires_grad or mine.is_inference()) and not torch.equal(mine, moved.cpu())
+                if changed:  # else autograd would take what it keeps for its backward pass to be written over
                     mine.copy_(moved.cpu())
         return each_tensor(result, back)
 
     return call
 
 
+def rasterizer_of(kind: Any) -> Any:
+    """In place of `sgwarp.compat.inria.GaussianRasterizer`, whose settings hold tensors as well."""
+
+    class Rasterizer:
+        def __init__(self, raster_settings: Any) -> None:
+            self.settings = raster_settings
+
+        def __call__(self, *args: Any, **kwargs: Any) -> Any:
+            return on_device(lambda settings, *a, **k: kind(settings)(*a, **k))(self.settings, *args, **kwargs)
+
+        def markVisible(self, positions: torch.Tensor) -> Any:
+            return on_device(lambda settings, points: kind(settings).markVisible(points))(self.settings, positions)
+
+    return Rasterizer
+
+
 def replace_operations(module: Any, patch: pytest.MonkeyPatch) -> None:
     """Put the operations that a test module names onto the device, also those it names by their modules."""
-    replaced = {}
+    kind = importlib.import_module("sgwarp.compat.inria").GaussianRasterizer
+    replaced = {kind: rasterizer_of(kind)}
     for path, names in OPERATIONS.items():
         home = importlib.import_module(path)
         replaced |= {getattr(home, name): on_device(getattr(home, name)) for name in names}
-    modules = [value for value in vars(module).values() if getattr(value, "__name__", None) in OPERATIONS]
+    known = OPERATIONS.keys() | BY_OTHER_NAMES
+    modules = [v for v in vars(module).values() if isinstance(v, ModuleType) and v.__name__ in known]
     for holder in (module, *modules):
-        for name, value in list(vars(holder).items()):
+        names = holder.__all__ if holder.__name__ == "sgwarp" else list(vars(holder))  # those of sgwarp load on use
+        for name in names:
+            value = getattr(holder, name)
             if callable(value) and isinstance(value.__hash__, Callable) and value in replaced:
                 patch.setattr(holder, name, replaced[value])

@@ -8,7 +8,9 @@ those of the block schedule on its fibers, and streams are checked but do not ru
 
 from __future__ import annotations
 
+import importlib
 import itertools
+import pkgutil
 import sys
 from collections import Counter
 from collections.abc import Callable, Iterator
@@ -26,6 +28,7 @@ from torch.utils._python_dispatch import TorchDispatchMode
 from torch.utils._pytree import tree_leaves, tree_map
 
 import sgwarp
+import sgwarp.ops
 from sgwarp.ops import launcher
 
 CUDA = torch.device("cuda", 0)
@@ -337,6 +340,9 @@ class _Functions(TorchFunctionMode):
             if func in (torch.Tensor.tolist, torch.Tensor.__repr__):
                 self.pretended.wait(func.__name__)
                 return func(plain(args[0].detach()))
+            if func is torch.Tensor.__format__:
+                self.pretended.wait("__format__")
+                return func(plain(args[0].detach()), *args[1:])
             if func is torch.Tensor.new_tensor:
                 return self._moved(torch.tensor(*args[1:], **({"dtype": args[0].dtype} | kwargs)), "cuda", {})
             if func is torch.Tensor.__deepcopy__:
@@ -445,6 +451,10 @@ def _pretend_gradients(patch: pytest.MonkeyPatch, device: PretendedDevice) -> No
 
         return run
 
+    for module in pkgutil.walk_packages(sgwarp.ops.__path__, "sgwarp.ops."):
+        importlib.import_module(
+            module.name
+        )  # all functions with a backward pass, whatever the test has imported so far
     for function in torch.autograd.Function.__subclasses__():
         if function.__module__.startswith("sgwarp."):
             patch.setattr(function, "backward", staticmethod(filled(function.backward)))

@@ -7,9 +7,7 @@ from sgwarp.kernels.gaussian import EXACT_OPTIONS
 from sgwarp.kernels.native import snippet
 from sgwarp.kernels.transmittance import Lanes
 
-wp.set_module_options(
-    EXACT_OPTIONS | {"cpu_compiler_flags": f"{EXACT_OPTIONS['cpu_compiler_flags']} -mprefer-vector-width=512"}
-)
+wp.set_module_options(EXACT_OPTIONS)
 
 UPDATE = """
     const auto& factor = factors.data[i];

@@ -12,7 +12,8 @@ import warp as wp
 
 from sgwarp.kernels.transmittance import LANE_OPTIONS, LANES, Lanes
 
-wp.set_module_options(LANE_OPTIONS)
+# Unrolled, sums over the window stay in registers.
+wp.set_module_options({**LANE_OPTIONS, "max_unroll": 16})
 
 RADIUS = 5  # of the window [pixels]
 DEVIATION = 1.5  # of its Gaussian [pixels]

@@ -174,9 +174,10 @@ def project_backward(
     q_v = weight * (guv * n_u + gvv * n_v)
     v_x = a * q_u
     v_y = b * q_u + c * q_v
-    if knobs.antialiased != 0:
+    half = 0.5 * g / LN_2
+    # A splat seen end on (sharp = 0) has no gradient here, and zero times infinity is NaN.
+    if knobs.antialiased != 0 and half != 0.0:
         # opacity sqrt(sharp / determinant): half the logarithm of both.
-        half = 0.5 * g / LN_2
         v_sharp = half * (1.0 / sharp - 1.0 / determinant)
         v_trace = -half * knobs.dilation / determinant
         v_x += 2.0 * (v_sharp * wp.cross(m_y, minors) + v_trace * m_x)

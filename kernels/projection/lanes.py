@@ -190,7 +190,9 @@ BACKWARD = (
     }
     if (knobs.antialiased) {
         // opacity sqrt(sharp / determinant): half the logarithm of both.
-        const Row half = 0.5f * moments[0], v_sharp = half * (1.0f / sharp - 1.0f / determinant);
+        // A splat seen end on (sharp = 0) has no gradient here, and zero times infinity is NaN.
+        const Row half = 0.5f * moments[0];
+        const Row v_sharp = half == zero ? zero : half * (1.0f / sharp - 1.0f / determinant);
         const Row v_trace = -half * knobs.dilation / determinant;
         for (int j = 0; j < 3; ++j) {
             const int k = (j + 1) % 3, l = (j + 2) % 3;

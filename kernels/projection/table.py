@@ -116,6 +116,7 @@ def gather_moments(
     v_conics: wp.array2d[float],  # [V, 3]
     v_factors: wp.array2d[wp.float64],  # [V, 3]
     v_compensations: wp.array[float],  # [V]
+    min_area_ratio: float,  # at which a compensation is held, and then has no gradient
     # Out:
     sums_out: wp.array2d[float],  # [N, 16] moments under 1, u, v, u^2, u v, v^2, the depth's gradient, seen; zeroed
 ):
@@ -152,7 +153,7 @@ def gather_moments(
         sums_out[i, 2] = float((wp.float64(v_means2d[k, 1]) / twice - b * gu) / c)
     if v_depths.shape[0] > 0:
         sums_out[i, AT_DEPTH] = v_depths[k]
-    if v_compensations.shape[0] > 0:
+    if v_compensations.shape[0] > 0 and table[k, 9] > wp.sqrt(min_area_ratio):
         sums_out[i, 0] = v_compensations[k] * table[k, 9]
     sums_out[i, SEEN] = 1.0
 

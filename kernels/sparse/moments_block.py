@@ -3,6 +3,8 @@
 A block leaves those of its rows, and the last block of a channel joins them in double precision.
 """
 
+from typing import Any
+
 import warp as wp
 
 from sgwarp.kernels.blocks import BLOCK, barrier, latest_double, put, put_double
@@ -63,8 +65,8 @@ def join_moments(
     t: int,
     sums: wp.tile[wp.float64],
     statistics_out: wp.array2d[float],
-    mean_out: wp.array[float],
-    variance_out: wp.array[float],
+    mean_out: wp.array[Any],
+    variance_out: wp.array[Any],
 ):
     """Statistics of all rows from those of the blocks, in double precision, counted from the first block's mean."""
     o = first_output + t % CHANNELS
@@ -101,5 +103,5 @@ def join_moments(
         statistics_out[1, o] = float(mean - wp.float64(high))
         statistics_out[2, o] = float(wp.float64(1.0) / wp.sqrt(variance + wp.float64(epsilon)))
         unbiased = float(variance * rows / (rows - wp.float64(1.0)))
-        mean_out[o] = (1.0 - momentum) * mean_out[o] + momentum * high
-        variance_out[o] = (1.0 - momentum) * variance_out[o] + momentum * unbiased
+        mean_out[o] = mean_out.dtype((1.0 - momentum) * float(mean_out[o]) + momentum * high)
+        variance_out[o] = variance_out.dtype((1.0 - momentum) * float(variance_out[o]) + momentum * unbiased)

@@ -5,6 +5,8 @@ the rows that its targets read, and the weights, in shared memory. A thread keep
 16 multiplications. Offsets without a pair in the block are skipped.
 """
 
+from typing import Any
+
 import warp as wp
 
 from sgwarp.kernels.blocks import BLOCK, barrier, put, put_int
@@ -23,8 +25,8 @@ Products = wp.types.vector(length=OWN * OWN, dtype=wp.float32)
 
 @wp.func
 def sum_products(
-    features: wp.array2d[float],
-    weight: wp.array3d[float],  # [K, C_in, C_out]
+    features: wp.array2d[Any],  # of any precision; the sums are float32
+    weight: wp.array3d[Any],  # [K, C_in, C_out], rounded to the precision of the features
     turned: int,  # whether it is multiplied from its other side
     table: wp.array2d[int],
     mirrored: int,  # whether the table's rows are those of the offsets in reverse
@@ -67,7 +69,7 @@ def sum_products(
                     source = wp.tile_extract(read, r)
                     value = float(0.0)
                     if source >= 0 and c0 + c < inputs:
-                        value = features[source, c0 + c]
+                        value = float(features[source, c0 + c])
                     put(rows, STRIDE * c + r, value)
                 near = t % CHANNELS
                 for far in range(t / CHANNELS, CHANNELS, LANES):
@@ -77,9 +79,9 @@ def sum_products(
                     value = float(0.0)
                     if c0 + c < inputs and first_output + o < outputs:
                         if turned != 0:
-                            value = weight[k, first_output + o, c0 + c]
+                            value = float(features.dtype(weight[k, first_output + o, c0 + c]))
                         else:
-                            value = weight[k, c0 + c, first_output + o]
+                            value = float(features.dtype(weight[k, c0 + c, first_output + o]))
                     put(weights, WIDTH * c + o, value)
                 barrier()
                 for c in range(CHANNELS):

@@ -3,6 +3,8 @@
 A table is walked entry by entry, those without a pair are left out, and the walk is shared out among blocks.
 """
 
+from typing import Any
+
 import warp as wp
 
 from sgwarp.kernels.blocks import BLOCK, barrier, put, put_int
@@ -60,8 +62,8 @@ def list_pairs_of_window(
 
 @wp.func
 def sum_weights(
-    features: wp.array2d[float],
-    gradient: wp.array2d[float],
+    features: wp.array2d[Any],
+    gradient: wp.array2d[Any],
     walked: wp.array2d[int],
     by_source: int,
     identity: int,
@@ -97,9 +99,9 @@ def sum_weights(
                 x = float(0.0)
                 v = float(0.0)
                 if c < features.shape[1]:
-                    x = features[wp.where(by_source != 0, walker, other), c]
+                    x = float(features[wp.where(by_source != 0, walker, other), c])
                 if o < gradient.shape[1]:
-                    v = gradient[wp.where(by_source != 0, other, walker), o]
+                    v = float(gradient[wp.where(by_source != 0, other, walker), o])
                 put(inputs, e, x)
                 put(outputs, e, v)
             barrier()

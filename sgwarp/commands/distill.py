@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
+from contextlib import ExitStack
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
@@ -109,8 +110,9 @@ class Distill(Options):
         from sgwarp.network.training.processes import joined
 
         log = self.start()
-        with joined(self.device) as processes:
-            from sgwarp.encoders.registry import keep_encoders
+        with ExitStack() as held:
+            processes = held.enter_context(joined(self.device))
+            from sgwarp.encoders.registry import kept_encoders
             from sgwarp.network.semantic_network import save_network
             from sgwarp.network.training.curves import write_curves
             from sgwarp.network.training.data import scenes_in
@@ -118,7 +120,7 @@ class Distill(Options):
 
             masks = self._masks_of if self.loss == "contrastive" else None
             if masks is not None:
-                keep_encoders()  # one network for the masks of all scenes
+                held.enter_context(kept_encoders())  # one network for the masks of all scenes
             scenes, validation = scenes_in(self.scenes, masks), scenes_in(self.validation or [])
             settings = self._settings()
             with show_progress("distill") as progress:

@@ -24,8 +24,10 @@ from sgwarp.encoders.base import MapSource, TextEncoder
 from sgwarp.encoders.registry import make_encoder, text_encoder_for
 from sgwarp.errors import InputError
 from sgwarp.lifting.lifter import lift
-from sgwarp.ops.launcher import get_threads, set_threads
+from sgwarp.ops.launcher import get_threads, load_together, set_threads
 from sgwarp.ops.splatting.forward import rasterize
+from sgwarp.ops.splatting.lift_loading import lifting_kernels
+from sgwarp.ops.splatting.loading import WIDE_PASS, rendering_kernels, wide_rendering_kernels
 from sgwarp.runs.log import RunLog, Watch, ignore
 from sgwarp.runs.progress import ShowProgress, hide_progress
 from sgwarp.scene import FeatureMap, View
@@ -128,7 +130,19 @@ def _encode(room: Room, source: MapSource, log: RunLog) -> dict[str, FeatureMap]
 
 
 def _compile(room: Room, maps: dict[str, FeatureMap], text: TextEncoder) -> None:
-    """Run the path on a part of the scene: Warp compiles every kernel at its first use, which is no part of a run."""
+    """Run the path on a part of the scene: Warp compiles every kernel at its first use, which is no part of a run.
+
+    On the CPU all of them are compiled before, side by side.
+    """
+    if room.gaussians.device.type == "cpu":
+        load_together(
+            [
+                *lifting_kernels(0, ids=True, squared=False),
+                *wide_rendering_kernels(16 * WIDE_PASS + 1, depth=False),  # passes of both widths
+                *rendering_kernels(harmonics=False, depth=False),
+                *rendering_kernels(harmonics=True, depth=True),
+            ]
+        )
     some = torch.arange(0, len(room.gaussians), SMALL, device=room.gaussians.device)
     small = replace(room, gaussians=room.gaussians.subset(some))
     measure(small, lift(small.gaussians, room.views[:2], maps), text)

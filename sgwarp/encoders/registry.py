@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
 from functools import partial
 from typing import Any
 
@@ -63,6 +64,18 @@ def keep_encoders() -> None:
     """
     global _kept
     _kept = {} if _kept is None else _kept
+
+
+@contextmanager
+def kept_encoders() -> Iterator[None]:
+    """The same within a block; what it kept is forgotten at its end, unless it was kept before."""
+    global _kept
+    before = _kept
+    keep_encoders()
+    try:
+        yield
+    finally:
+        _kept = before
 
 
 def _make_member(member: Member, request: Request) -> MapSource:

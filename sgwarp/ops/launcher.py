@@ -79,6 +79,7 @@ def _after_fork() -> None:
     """
     global _pool, _pool_lock, _local
     _pool, _pool_lock, _local = None, threading.Lock(), threading.local()
+    _compilers.clear()
     _idle.clear()
     torch.set_num_threads(1)
 
@@ -199,22 +200,40 @@ def launch(
 
 
 _loaded: set[str] = set()  # modules that `load_together` has seen
+_compilers: dict[str, ThreadPoolExecutor] = {}  # a thread for each set of compiler options
 
 
 def load_together(kernels: Sequence[wp.Kernel]) -> None:
-    """Load the modules of these kernels on the CPU, side by side on as many threads as launches use.
+    """Load the modules of these kernels on the CPU, side by side; what is not in the cache is compiled.
 
-    What is not in the cache is compiled. The second time this costs nothing.
+    Modules of the same compiler options are loaded by one thread, which is kept: Warp compiles its headers once for
+    each thread and set of options, and that takes longer than several modules. The second time this costs nothing.
     """
     unseen = list({k.module.name: k.module for k in kernels if k.module.name not in _loaded}.values())
     if not unseen:
         return
     _loaded.update(module.name for module in unseen)
-    if len(unseen) == 1 or _thread_count == 1:
+    if _thread_count == 1:
         return  # the launch does it
-    # What fails here fails again at the launch, which mends the cache or says what is wrong with it.
-    with suppress(Exception):
-        wp.force_load("cpu", modules=unseen, block_dim=1, max_workers=_thread_count)
+    alike: dict[str, list[Any]] = {}
+    for module in unseen:
+        alike.setdefault(str(module.options["cpu_compiler_flags"]), []).append(module)
+    loading = [_compiler(flags).submit(_load, modules) for flags, modules in alike.items()]
+    for done in loading:
+        # What fails here fails again at the launch, which mends the cache or says what is wrong with it.
+        with suppress(Exception):
+            done.result()
+
+
+def _compiler(flags: str) -> ThreadPoolExecutor:
+    with _pool_lock:
+        if flags not in _compilers:
+            _compilers[flags] = ThreadPoolExecutor(max_workers=1, thread_name_prefix="sgwarp-compiler")
+        return _compilers[flags]
+
+
+def _load(modules: list[Any]) -> None:
+    wp.force_load("cpu", modules=modules, block_dim=1, max_workers=1)
 
 
 def launch_blocks(

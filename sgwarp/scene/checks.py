@@ -80,3 +80,17 @@ def require_rows(name: str, bad: Tensor, rule: str, values: Tensor) -> None:
     if bool(rows.any()):
         index = int(rows.nonzero()[0])
         raise InputError(f"{name}[{index}] = {values[index].tolist()}: {rule} ({int(rows.sum())} such rows)")
+
+
+def require_cameras(viewmats: Tensor, Ks: Tensor) -> None:
+    """Refuse cameras that see nothing at all, which would be a black image without a word; not on CUDA.
+
+    Raises:
+        InputError: NaN or infinity, a view matrix that has no inverse, or a focal length of zero.
+    """
+    require_finite("viewmats", viewmats)
+    require_finite("Ks", Ks)
+    if not viewmats.is_cuda and bool((torch.linalg.det(viewmats.detach().to(torch.float64)) == 0).any()):
+        raise InputError("viewmats: a matrix has no inverse; expected world to camera, a rotation and a translation")
+    if not Ks.is_cuda and bool((Ks.detach()[..., [0, 1], [0, 1]] == 0).any()):
+        raise InputError("Ks: a focal length is zero; expected [[fx, 0, cx], [0, fy, cy], [0, 0, 1]] in pixels")

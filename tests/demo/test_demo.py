@@ -19,7 +19,7 @@ from sgwarp.errors import InputError
 from sgwarp.files.images import read_rgb
 from sgwarp.lifting.lifter import lift
 from sgwarp.metrics.segmentation import ConfusionMatrix
-from sgwarp.scene import Camera, View
+from sgwarp.scene import Camera, FeatureMap, View
 
 pytestmark = pytest.mark.slow
 
@@ -100,6 +100,20 @@ def test_texts_are_measured_by_their_scores(room):
     scores = result.findings[0].scores
     assert -0.1 <= scores[torch.isfinite(scores)].min() < 0.1
     assert 0.5 < scores.max() < 1.5
+
+
+def test_the_kernels_of_a_run_are_compiled_together(room, modules):
+    """What is loaded is what is launched: no more, or compiling it would be in vain, and no less."""
+    loaded, launched = modules
+    names = [f"name {k}" for k in range(80 - len(room.names))]  # channels for passes of both widths
+    text = NoisyText([*room.names, *names])
+    maps = {}
+    for view in room.views[:2]:
+        labels = room.label_map(view)
+        maps[view.stem] = FeatureMap("labels", ids=labels.ids, vectors=torch.eye(len(labels.labels), 80))
+    run._compile(replace(room, views=room.views[:2]), maps, text)
+    assert launched
+    assert loaded == launched
 
 
 def test_localised_counts_the_largest_sights():

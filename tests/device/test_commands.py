@@ -1,6 +1,7 @@
 """Training, and every command with `--device cuda`, on a pretended CUDA device."""
 
 import json
+from collections import Counter
 from dataclasses import dataclass, replace
 
 import pytest
@@ -66,7 +67,13 @@ def test_the_report_checks_the_extremes_on_the_device(stage_files, tmp_path, mon
     scene = tmp_path / "scene.ply"
     sg.save_gaussians(stage_files.gaussians.subset(torch.arange(0, len(stage_files.gaussians), 20)), scene)
     options = ["--patches", "2", "--repeats", "1"]
+    pretended_cuda.reset()
     run("report", scene, "--views", stage_files.views, "--out", tmp_path, *options)
+    launched = Counter(pretended_cuda.launches)
+    assert launched["composite_colors_block"] + launched["composite_features_block"] > 10
+    # The host waits for each list of tiles, and for what was left out of each picture of the extremes.
+    waits = Counter(place for _, place in pretended_cuda.waits if place.startswith("ops/splatting/tiles.py"))
+    assert sorted(waits.values()) == [2 * len(few), launched["count_splat_tiles"]]
     found = json.loads((tmp_path / "report.json").read_text())
     assert found["about"]["device"] == "cuda:0"
     assert [row["schedule"] for row in found["stability"]] == ["block"] * len(few)

@@ -158,21 +158,71 @@ def test_next_to_no_voxels(nets, count, training):
             assert_near(mine.double(), exact.double(), 1e-4)
 
 
-@pytest.mark.parametrize("how", ["double", "bfloat16", "autocast"])
-def test_other_precisions_take_the_layers_one_by_one(nets, how, pretended_cuda):
-    here, there = nets
-    if how != "autocast":
-        here, there = (net.to(getattr(torch, how)) for net in nets)
-    dtype = torch.float32 if how == "autocast" else getattr(torch, how)
+def results_of(nets, dtype, autocast):
+    """Features that both networks give, and their parameters' gradients, after a step."""
     results = []
-    for net, device in ((here, "cpu"), (there, "cuda")):
+    for net, device in zip(nets, ("cpu", "cuda"), strict=True):
         x = cloud(100, device, 5)
         x = x.with_features(x.features.to(dtype))
-        with torch.autocast(device, dtype=torch.bfloat16, enabled=how == "autocast"):
+        with torch.autocast(device, dtype=autocast or torch.bfloat16, enabled=autocast is not None):
             y = net(x).features
         y.float().square().mean().backward()
         results.append(y.detach())
+    return results
+
+
+def test_double_precision_takes_the_layers_one_by_one(nets, pretended_cuda):
+    exact, mine = results_of([net.double() for net in nets], torch.float64, None)
     assert "normalize_elements" not in pretended_cuda.launches
-    assert results[0].dtype == results[1].dtype == (torch.float64 if how == "double" else torch.bfloat16)
-    assert_near(results[1].double(), results[0].double(), 1e-9 if how == "double" else 0.2)
-    assert all(p.grad is not None for p in there.parameters())
+    assert mine.dtype == torch.float64
+    assert_near(mine, exact, 1e-9)
+
+
+@pytest.mark.parametrize("how", ["bfloat16", "autocast bfloat16", "autocast float16"])
+def test_half_precision_is_near_double(nets, how, pretended_cuda):
+    """As near as the CPU is, which takes the layers one by one, but for a factor of two; gradients stay float32."""
+    here, there = nets
+    exact = copy.deepcopy(here).double()
+    x = cloud(100, "cpu", 5)
+    wanted = exact(x.with_features(x.features.double())).features
+    wanted.square().mean().backward()
+    half = getattr(torch, how.split()[-1])
+    if how == "bfloat16":
+        results = results_of([net.to(half) for net in nets], half, None)
+    else:
+        results = results_of(nets, torch.float32, half)
+    assert "normalize_elements" in pretended_cuda.launches
+    assert results[0].dtype == results[1].dtype == half
+    errors = [float((y.cpu().double() - wanted.detach()).norm() / wanted.detach().norm()) for y in results]
+    assert errors[1] <= 2 * errors[0], errors
+    assert errors[0] < 0.1
+    slopes = torch.cat([p.grad.flatten() for p in exact.parameters()])
+    kept = half if how == "bfloat16" else torch.float32
+    for name, net, bound in (("cpu", here, None), ("cuda", there, 2.0)):
+        assert all(p.grad.dtype == kept for p in net.parameters())
+        ours = torch.cat([p.grad.cpu().double().flatten() for p in net.parameters()])
+        error = float((ours - slopes).norm() / slopes.norm())
+        if bound is None:
+            usual = error
+        else:
+            assert error <= bound * usual, (name, error, usual)
+
+
+def test_a_training_step_under_autocast_takes_no_more_launches(net, voxels, pretended_cuda):
+    """What single precision does not have is the rounding of the first input."""
+    counts = []
+    for half in (False, True):
+        pretended_cuda.reset()
+        with torch.autocast("cuda", dtype=torch.bfloat16, enabled=half):
+            y = net(voxels).features
+        y.float().square().mean().backward()
+        counts.append(pretended_cuda.work)
+        for parameter in net.parameters():
+            parameter.grad = None
+    assert counts[1] <= counts[0] + 10, counts
+    net.eval()
+    pretended_cuda.reset()
+    with torch.inference_mode(), torch.autocast("cuda", dtype=torch.bfloat16):
+        net(voxels)
+    assert pretended_cuda.launches.count("convolve_and_finish_blocks") == 62
+    assert pretended_cuda.work < 95

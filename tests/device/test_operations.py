@@ -1,6 +1,7 @@
 """Every public operation on a pretended CUDA device: same results as on the CPU, waits and launches counted."""
 
 import math
+from dataclasses import replace
 
 import pytest
 import torch
@@ -9,6 +10,7 @@ import sgwarp as sg
 from sgwarp.compat import gsplat, inria
 from sgwarp.ops.neighbors import mean_squared_neighbor_distance
 from sgwarp.ops.photometric import photometric_loss
+from sgwarp.ops.reference import rasterizer as reference
 from sgwarp.ops.splatting.lifting import LiftSums, lift_view
 
 COUNT = "ops/splatting/tiles.py"  # where the host waits for the number of intersections
@@ -283,7 +285,7 @@ def inria_image(gaussians, settings):
     values = leaves(gaussians, gaussians.sh)
     points = torch.zeros_like(values[0]).requires_grad_()
     rasterizer = inria.GaussianRasterizer(settings)
-    image, _ = rasterizer(values[0], points, values[3][:, None], shs=values[4], scales=values[2], rotations=values[1])
+    image, *_ = rasterizer(values[0], points, values[3][:, None], shs=values[4], scales=values[2], rotations=values[1])
     image.square().mean().backward()
     assert rasterizer.markVisible(values[0].detach()).any()
     return image.detach(), values[0].grad
@@ -297,14 +299,85 @@ def test_the_rasterizer_of_inria(make_scene, pretended_cuda):
     assert (gradient_there.cpu() - gradient).norm() < 5e-3 * gradient.norm()
 
 
-def test_the_facade_of_inria_shades_by_kernels(make_scene, pretended_cuda):
-    """In torch, forward and backward took 403 launches and operations that run something."""
+@pytest.mark.parametrize("antialiasing", [None, True])
+def test_the_facade_of_inria_projects_and_shades_by_kernels(make_scene, pretended_cuda, antialiasing):
+    """In torch, forward and backward took 403 launches and operations that run something, without antialiasing."""
     scene = make_scene("sh3")
-    there, settings = scene.gaussians.to("cuda"), inria_settings(scene.camera, "cuda")
+    there = scene.gaussians.to("cuda")
+    settings = inria_settings(scene.camera, "cuda")._replace(antialiasing=antialiasing)
     pretended_cuda.reset()
     inria_image(there, settings)
-    assert {"evaluate_harmonics", "harmonics_backward"} <= set(pretended_cuda.launches)
-    assert pretended_cuda.work < 230
+    assert {"tabulate_splats", "gather_moments", "evaluate_harmonics", "harmonics_backward"} <= set(
+        pretended_cuda.launches
+    )
+    assert pretended_cuda.work < 250
+
+
+def test_the_antialiasing_of_inria_against_the_oracle(make_scene, pretended_cuda):
+    """Image and every gradient, of small Gaussians too, against autograd in float64."""
+    scene = make_scene("random_cloud")
+    gaussians, camera = scene.gaussians, scene.camera
+    scales = gaussians.scales.clone()
+    scales[::3] *= 0.05
+    gaussians = replace(gaussians, scales=scales)
+    options = reference.ReferenceSettings(alpha_max=0.99, antialiased=True)
+    exact = [t.detach().double().requires_grad_() for t in leaves(gaussians, gaussians.sh)]
+    means, quats, scales, opacities, sh = exact
+    pose = camera.world_to_camera.double()
+    size = (camera.width, camera.height)
+    projection = reference.project(
+        means, quats, scales, opacities, pose, camera.K.double(), *size, near=0.2, settings=options
+    )
+    colors = reference.spherical_harmonics(means, sh, pose)
+    wanted = reference.composite(projection, colors, *size, torch.zeros(3).double(), options)
+    clear = wanted.margin > 1e-4
+    assert clear.double().mean() > 0.9
+    noise = torch.randn(*camera.size, 3, generator=torch.Generator().manual_seed(2)) * clear[..., None]
+    degree = math.isqrt(gaussians.sh.shape[1]) - 1
+    settings = inria_settings(camera, "cuda")._replace(antialiasing=True, sh_degree=degree)
+    there = gaussians.to("cuda")
+    mine = leaves(there, there.sh)
+    image, _, _ = inria.GaussianRasterizer(settings)(
+        mine[0], None, mine[3][:, None], shs=mine[4], scales=mine[2], rotations=mine[1]
+    )
+    image = image.permute(1, 2, 0)
+    torch.testing.assert_close(image.detach().cpu().double()[clear], wanted.features.detach()[clear], rtol=0, atol=2e-5)
+    (image * noise.to("cuda")).sum().backward()
+    (wanted.features * noise.double()).sum().backward()
+    for name, got, want in zip(("means", "quats", "scales", "opacities", "sh"), mine, exact, strict=True):
+        error = (got.grad.cpu() - want.grad).abs().max()
+        assert error <= 1e-3 * want.grad.abs().max(), f"{name}: {error}"
+
+
+def test_the_gradient_of_campos(make_scene, pretended_cuda):
+    """Where it is the camera's centre and where it is not, against autograd in float64."""
+    scene = make_scene("sh3")
+    camera, there = scene.camera, scene.gaussians.to("cuda")
+    noise = torch.randn(3, *camera.size, generator=torch.Generator().manual_seed(4))
+    opaque = {"scales": there.scales, "rotations": there.quats}
+    for shift in (0.0, 0.4):
+        settings = inria_settings(camera, "cuda")
+        campos = (settings.campos.cpu() + shift).to("cuda").requires_grad_()
+        pretended_cuda.reset()
+        image, _ = inria.GaussianRasterizer(settings._replace(campos=campos))(
+            there.means, None, there.opacities[:, None], shs=there.sh, **opaque
+        )
+        (image * noise.to("cuda")).sum().backward()
+        assert "harmonics_backward" in pretended_cuda.launches
+        # What the image says to the colors is not in question: that of the harmonics to the centre is, in float64.
+        exact = campos.detach().cpu().double().requires_grad_()
+        directions = torch.nn.functional.normalize(scene.gaussians.means.double() - exact, dim=1)
+        basis = reference.harmonics(directions, 3)
+        colors = (torch.einsum("nk,nkc->nc", basis, scene.gaussians.sh.double()) + 0.5).clamp(min=0)
+        leaf = colors.detach().float().to("cuda").requires_grad_()
+        again, _ = inria.GaussianRasterizer(settings)(
+            there.means, None, there.opacities[:, None], colors_precomp=leaf, **opaque
+        )
+        torch.testing.assert_close(image.detach().cpu(), again.detach().cpu(), rtol=0, atol=2e-5)
+        (again * noise.to("cuda")).sum().backward()
+        colors.backward(leaf.grad.cpu().double())
+        assert exact.grad.abs().max() > 0
+        assert (campos.grad.cpu() - exact.grad).abs().max() <= 1e-3 * exact.grad.abs().max()
 
 
 def test_inria_looks_from_campos(make_scene, pretended_cuda):

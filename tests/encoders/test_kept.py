@@ -2,7 +2,9 @@
 
 import pytest
 
+from sgwarp.commands.distill import Distill
 from sgwarp.encoders import registry
+from sgwarp.errors import InputError
 
 
 @pytest.fixture
@@ -41,6 +43,44 @@ def test_files_are_never_kept(made):
     registry.keep_encoders()
     assert registry.make_encoder("files:labels") is not registry.make_encoder("files:labels")
     assert len(made) == 2
+
+
+def test_a_block_forgets_what_it_kept(made):
+    first = None
+
+    def fail():
+        nonlocal first
+        with registry.kept_encoders():
+            first = registry.make_encoder("conse")
+            assert registry.make_encoder("conse") is first
+            raise KeyError
+
+    with pytest.raises(KeyError):
+        fail()
+    assert registry.make_encoder("conse") is not first
+    registry.keep_encoders()
+    first = registry.make_encoder("conse")
+    with registry.kept_encoders():
+        assert registry.make_encoder("conse") is first
+        inner = registry.make_encoder("clip:A")
+    assert registry.make_encoder("clip:A") is inner  # the process keeps them all
+
+
+@pytest.mark.parametrize(("loss", "kept"), [("contrastive", True), ("cosine", False)])
+def test_distillation_keeps_the_networks_of_masks_while_it_runs(loss, kept, monkeypatch, tmp_path):
+    seen = []
+
+    def distill(*args, **options):
+        seen.append(registry._kept is not None)
+        raise InputError("enough")
+
+    monkeypatch.setattr(registry, "_kept", None)
+    monkeypatch.setattr("sgwarp.network.training.trainer.distill", distill)
+    monkeypatch.setattr("sgwarp.network.training.data.scenes_in", lambda *args: [])
+    with pytest.raises(InputError, match="enough"):
+        Distill(scenes=[tmp_path], loss=loss, out=tmp_path / "net.safetensors").run()
+    assert seen == [kept]
+    assert registry._kept is None
 
 
 def test_text_sides_are_kept_for_all_that_they_depend_on(monkeypatch):

@@ -16,7 +16,7 @@ from sgwarp.kernels.compositing import block as compositing_block
 from sgwarp.kernels.compositing import block_backward as compositing_block_backward
 from sgwarp.kernels.contributors import pairs as pixel_lists
 from sgwarp.kernels.lifting import block as lifting_block
-from sgwarp.kernels.sparse import voxels
+from sgwarp.kernels.sparse import convolution_block, normalization_block, voxels
 from sgwarp.ops import launcher  # noqa: F401 - starts Warp quietly
 
 pytestmark = pytest.mark.slow
@@ -46,6 +46,10 @@ def cuda_kernels() -> list[wp.Kernel]:
         kernels += [lifting_block.make_lift_ids_block(flag, squared) for squared in (False, True)]
         kernels.append(pixel_lists.make_list_contributors(flag))
         kernels.append(voxels.make_list_pairs(flag))
+    half, single = (wp.float16, wp.bfloat16), wp.float32
+    for types in ((single, single), *((value, single) for value in half), *((value, value) for value in half)):
+        for module in (convolution_block, normalization_block):
+            kernels += [make(*types) for name, make in vars(module).items() if name.startswith("make_")]
     for wide, ordered in pairs:
         # The options go together here: each adds its own lines to a kernel, and together they need most registers.
         kernels.append(compositing_block_backward.make_composite_backward_block(wide, ordered, ordered, ordered))

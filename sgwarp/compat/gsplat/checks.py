@@ -8,7 +8,6 @@ import torch
 from torch import Tensor
 
 from sgwarp.errors import InputError
-from sgwarp.scene.checks import require_finite
 
 TILE_SIZE = 16
 
@@ -26,20 +25,6 @@ def expect_shape(name: str, tensor: Any, *shapes: tuple[int | None, ...]) -> Non
         if len(shape) == tensor.ndim and all(w in (None, s) for w, s in zip(shape, tensor.shape, strict=True)):
             return
     raise InputError(f"{name}: expected shape {wanted}, got {list(tensor.shape)}")
-
-
-def expect_cameras(viewmats: Tensor, Ks: Tensor) -> None:
-    """Raise for cameras that see nothing at all, which would be a black image without a word; not on CUDA.
-
-    Raises:
-        InputError: NaN or infinity, a view matrix that has no inverse, or a focal length of zero.
-    """
-    require_finite("viewmats", viewmats)
-    require_finite("Ks", Ks)
-    if not viewmats.is_cuda and bool((torch.linalg.det(viewmats.detach().to(torch.float64)) == 0).any()):
-        raise InputError("viewmats: a matrix has no inverse; expected world to camera, a rotation and a translation")
-    if not Ks.is_cuda and bool((Ks.detach()[..., [0, 1], [0, 1]] == 0).any()):
-        raise InputError("Ks: a focal length is zero; expected [[fx, 0, cx], [0, fy, cy], [0, 0, 1]] in pixels")
 
 
 def widen(*tensors: Any) -> tuple[Any, ...]:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from torch import Tensor
 
-from sgwarp.compat.gsplat.checks import expect_cameras, expect_shape
+from sgwarp.compat.gsplat.checks import expect_shape
 from sgwarp.compat.gsplat.meta import Images, SplatTable
 from sgwarp.errors import InputError
 from sgwarp.ops.planar.projection import (
@@ -15,6 +15,7 @@ from sgwarp.ops.planar.projection import (
     unpack_symmetric,
 )
 from sgwarp.runs.isolation import isolated
+from sgwarp.scene.checks import require_cameras
 
 
 def project_images(
@@ -36,7 +37,7 @@ def project_images(
     expect_shape("means", means, (*batch, N, 3))
     expect_shape("viewmats", viewmats, (*batch, C, 4, 4))
     expect_shape("Ks", Ks, (*batch, C, 3, 3))
-    expect_cameras(viewmats, Ks)
+    require_cameras(viewmats, Ks)
     if covars is None:
         expect_shape("quats", quats, (*batch, N, 4))
         expect_shape("scales", scales, (*batch, N, 3))

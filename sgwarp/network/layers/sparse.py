@@ -13,7 +13,7 @@ import torch
 from torch import Tensor, nn
 
 from sgwarp.errors import InputError
-from sgwarp.ops.sparse.blocks import MAX_OFFSETS, Running
+from sgwarp.ops.sparse.blocks import MAX_OFFSETS, TYPES, Running
 from sgwarp.ops.sparse.convolution import sparse_conv
 from sgwarp.ops.sparse.normalization import Normalization, convolve_and_normalize
 from sgwarp.ops.sparse.voxels import KernelMap, coarsen, kernel_map, unpack_voxels
@@ -212,19 +212,20 @@ def normalized(
 ) -> tuple[SparseTensor, SparseTensor]:
     """norm(conv(x)) + shortcut, what is negative becoming zero, joined with `beside`; and x, to go on with.
 
-    On CUDA in single precision kernels do it all, and call neither module nor its hooks; elsewhere the modules do it
-    one after the other. Going on with the x that comes back spares its gradient an addition there.
+    On CUDA in single and half precision kernels do it all, and call neither module nor its hooks; elsewhere the modules
+    do it one after the other. Going on with the x that comes back spares its gradient an addition there.
     """
-    if _is_fused(x, conv.kernel, norm):
+    dtype = _fused_dtype(x, conv.kernel, norm)
+    if dtype is not None:
         pairs, stride = conv.connect(x)
         if pairs.offsets <= MAX_OFFSETS:
             z, through = convolve_and_normalize(
-                x.features,
+                x.features.to(dtype),
                 conv.weight,
                 pairs,
                 norm.as_rows(pairs.target_count, rectify),
-                None if shortcut is None else shortcut.features,
-                None if beside is None else beside.features,
+                None if shortcut is None else shortcut.features.to(dtype),
+                None if beside is None else beside.features.to(dtype),
             )
             return SparseTensor(z, x.grid, stride), x.with_features(through)
     y: SparseTensor = norm(conv(x))
@@ -235,12 +236,16 @@ def normalized(
     return y if beside is None else join(y, beside), x
 
 
-def _is_fused(x: SparseTensor, kernel: Tensor, norm: BatchNorm) -> bool:
-    """Whether kernels take the whole layer."""
-    tensors = (x.features, kernel, norm.bn.weight, norm.bn.bias, norm.bn.running_mean, norm.bn.running_var)
-    if not x.features.is_cuda or torch.is_autocast_enabled("cuda"):
-        return False
-    return all(tensor is not None and tensor.dtype == torch.float32 for tensor in tensors)
+def _fused_dtype(x: SparseTensor, kernel: Tensor, norm: BatchNorm) -> torch.dtype | None:
+    """Precision of the features in which kernels take the whole layer, None where they do not."""
+    tensors = (kernel, norm.bn.weight, norm.bn.bias, norm.bn.running_mean, norm.bn.running_var)
+    dtype = x.features.dtype
+    if not x.features.is_cuda:
+        return None
+    if torch.is_autocast_enabled("cuda") and dtype != torch.float64:
+        dtype = torch.get_autocast_dtype("cuda")
+    parameters = {None if tensor is None else tensor.dtype for tensor in tensors}
+    return dtype if dtype in TYPES and parameters in ({torch.float32}, {dtype}) else None
 
 
 def relu(x: SparseTensor) -> SparseTensor:

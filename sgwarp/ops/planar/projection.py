@@ -208,13 +208,8 @@ def _by_kernels(
     """The table made by kernels, or None where they cannot make it."""
     fields = [means, quats, scales] + ([] if opacities is None else [opacities])
     single = all(t is not None and t.dtype == torch.float32 for t in fields)
-    # A compensation that is clamped has no gradient, which the kernels do not know; with opacities and the usual clamp
-    # such a splat is too faint to be kept.
-    bounded = settings.compensated and (
-        opacities is None or settings.min_area_ratio > ProjectionSettings.min_area_ratio
-    )
     plain = settings.camera_model == "pinhole" and 2.0**-16 <= settings.alpha_min < ALPHA_MAX and settings.near > 0
-    if covars is not None or not single or bounded or not plain or K.requires_grad:
+    if covars is not None or not single or not plain or K.requires_grad:
         return None
     from sgwarp.ops.planar.tables import ProjectTable, TableRequest, read_camera
 

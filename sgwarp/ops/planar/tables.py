@@ -21,6 +21,7 @@ from sgwarp.ops.splatting.backward import SplatGradients
 from sgwarp.ops.splatting.forward import LANE
 from sgwarp.ops.splatting.settings import RasterSettings
 from sgwarp.scene import Camera, Gaussians
+from sgwarp.scene.checks import require_cameras
 
 if TYPE_CHECKING:
     from sgwarp.ops.planar.projection import ProjectionSettings
@@ -49,12 +50,18 @@ class TableRequest:
 
 
 def read_camera(world_to_camera: Tensor, K: Tensor, width: int, height: int, near: float, far: float) -> Camera | None:
-    """The camera on the host, for which it waits once; None if it is none that the kernels know."""
+    """The camera on the host, for which it waits once; None if it is none that the kernels know.
+
+    Raises:
+        InputError: It sees nothing at all.
+    """
     pose, intrinsics = (t.detach().to(torch.float64).flatten() for t in (world_to_camera, K))
     if pose.device == intrinsics.device:
         pose, intrinsics = torch.cat([pose, intrinsics]).cpu().split([16, 9])
+    pose, intrinsics = pose.cpu().view(4, 4), intrinsics.cpu().view(3, 3)
+    require_cameras(pose, intrinsics)
     try:
-        return Camera(intrinsics.cpu().view(3, 3), pose.cpu().view(4, 4), width, height, near, far)
+        return Camera(intrinsics, pose, width, height, near, far)
     except InputError:
         return None
 
@@ -101,6 +108,7 @@ class ProjectTable(torch.autograd.Function):
             empty = torch.empty((0,) * dims, dtype=dtype, device=means.device)
             values = empty if gradient is None else gradient.to(dtype).contiguous()
             inputs.append(view(values, wp.float64 if double else wp.float32))
+        inputs.append(request.settings.min_area_ratio)
         launch_plain(kernels.gather_moments, len(index), inputs, [view(sums, wp.float32)], device=means.device)
         opacities = request.opacities if len(request.opacities) else means.new_ones(len(means))
         gaussians = Gaussians.unchecked(means, quats, scales, opacities, means.new_zeros(len(means), 1, 3))

@@ -1,8 +1,11 @@
-"""Host side of the block schedule of sparse convolutions: single precision, one launch each."""
+"""Host side of the block schedule of sparse convolutions: one launch each, in single and half precision.
+
+Features of half precision stay so in memory; all sums are float32. Weights may be float32: the kernels round them.
+"""
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import torch
 import warp as wp
@@ -14,6 +17,7 @@ from sgwarp.ops.launcher import counters, launch_blocks, scratch, view
 from sgwarp.ops.sparse.voxels import KernelMap
 
 MAX_OFFSETS = kernels.MAX_OFFSETS
+TYPES = {torch.float32: wp.float32, torch.float16: wp.float16, torch.bfloat16: wp.bfloat16}
 BUSY_BLOCKS, MAX_SHARES = 1024, 16  # of a gradient of the weights: a large GPU has 132 multiprocessors
 
 
@@ -30,6 +34,21 @@ def fits_blocks(dtype: torch.dtype, kernel_map: KernelMap, schedule: str | None)
     """Whether the kernels of the block schedule take it: on CUDA, all but double precision and very large kernels."""
     on_cuda = kernel_map.device.type == "cuda" if schedule is None else schedule == "block"
     return on_cuda and dtype != torch.float64 and kernel_map.offsets <= MAX_OFFSETS
+
+
+def typed(tensor: Tensor) -> Any:
+    """The tensor for a kernel that takes its precision."""
+    return view(tensor, TYPES[tensor.dtype])
+
+
+def types_of(features: Tensor, parameter: Tensor) -> tuple[Any, Any]:
+    """What the factories of kernels are asked for."""
+    return TYPES[features.dtype], TYPES[parameter.dtype]
+
+
+def weight_for(weight: Tensor, dtype: torch.dtype) -> Tensor:
+    """The weight as kernels take it beside features of this precision: of the same, or float32."""
+    return weight if weight.dtype == torch.float32 else weight.to(dtype)
 
 
 def parts_of(count: int, size: int) -> int:
@@ -50,19 +69,19 @@ def convolve(
     """y, [M, C_out], and with `running`, which it changes, the statistics of y: mean, rest of the mean and inverse
     deviation, [3, C_out]; at least two rows."""
     outputs, device = weight.shape[2], features.device
-    y = torch.empty(kernel_map.target_count, outputs, device=device)
+    y = torch.empty(kernel_map.target_count, outputs, dtype=features.dtype, device=device)
     statistics = torch.empty(0 if running is None else 3, outputs, device=device)
     if not y.numel():
         return y, statistics
     table, mirrored = kernel_map.table(by_target=True)
     grid = [parts_of(len(y), products_block.TARGETS), parts_of(outputs, products_block.CHANNELS)]
     moments = scratch("sparse moments", 2 * grid[0] * outputs if running else 0, torch.float64, device)
-    mean, variance, epsilon, momentum = running or (y.new_empty(0), y.new_empty(0), 0.0, 0.0)
-    inputs = [view(rows_of(features), wp.float32), view(weight, wp.float32), view(table, wp.int32), int(mirrored)]
+    mean, variance, epsilon, momentum = running or (weight.new_empty(0), weight.new_empty(0), 0.0, 0.0)
+    inputs = [typed(rows_of(features)), typed(weight), view(table, wp.int32), int(mirrored)]
     inputs += [_identity(kernel_map), epsilon, momentum, view(moments, wp.float64)]
     inputs.append(view(counters(grid[1], device), wp.int32))
-    outs = [view(tensor, wp.float32) for tensor in (y, statistics, mean, variance)]
-    launch_blocks(kernels.convolve_blocks, grid, inputs, outs, device=device)
+    kernel = kernels.make_convolve_blocks(*types_of(features, weight))
+    launch_blocks(kernel, grid, inputs, [typed(t) for t in (y, statistics, mean, variance)], device=device)
     return y, statistics
 
 
@@ -95,15 +114,14 @@ def gradients(
     partial = scratch("sparse shares", shares * weight.numel() if shares > 1 else 0, torch.float32, device)
     nothing = features.new_empty(0, 0)
     added = nothing if addend is None else rows_of(addend)
-    arguments = [view(rows_of(tensor), wp.float32) for tensor in (features, grad)]
-    arguments += [view(weight, wp.float32), view(table, wp.int32), int(mirrored), identity, view(added, wp.float32)]
+    arguments = [typed(rows_of(features)), typed(rows_of(grad)), typed(weight)]
+    arguments += [view(table, wp.int32), int(mirrored), identity, typed(added)]
     arguments += [feature_blocks, view(walked, wp.int32), int(by_source), shares, view(partial, wp.float32)]
     arguments.append(view(counters(pieces, device), wp.int32))
-    outs = [
-        view(nothing if v_features is None else v_features, wp.float32),
-        view(nothing[None] if v_weight is None else v_weight, wp.float32),
-    ]
-    launch_blocks(kernels.convolve_backward_blocks, [blocks], arguments, outs, device=device)
+    outs = [typed(nothing if v_features is None else v_features)]
+    outs.append(typed(weight.new_empty(0, 0, 0) if v_weight is None else v_weight))
+    kernel = kernels.make_convolve_backward_blocks(*types_of(features, weight))
+    launch_blocks(kernel, [blocks], arguments, outs, device=device)
     return v_features, v_weight
 
 

@@ -64,11 +64,9 @@ class _SparseConv(torch.autograd.Function):
         ctx.save_for_backward(features, weight)
         ctx.kernel_map, ctx.in_blocks = kernel_map, blocks.fits_blocks(features.dtype, kernel_map, schedule)
         with torch.autocast(features.device.type, enabled=False):
-            weight = weight.to(features.dtype)
-            if not ctx.in_blocks:
-                return _convolve(features, weight, kernel_map)
-            # Half precision is rounded as it is given; products and sums are single precision.
-            return blocks.convolve(features.float(), weight.float(), kernel_map)[0].to(features.dtype)
+            if ctx.in_blocks:
+                return blocks.convolve(features, blocks.weight_for(weight, features.dtype), kernel_map)[0]
+            return _convolve(features, weight.to(features.dtype), kernel_map)
 
     @staticmethod
     @once_differentiable
@@ -77,14 +75,12 @@ class _SparseConv(torch.autograd.Function):
         for_features, for_weight = ctx.needs_input_grad[:2]
         v_features = v_weight = None
         with torch.autocast(features.device.type, enabled=False):
-            grad = grad.to(features.dtype).contiguous()
-            rounded = weight.to(features.dtype)
+            grad = grad.to(features.dtype)
             if ctx.in_blocks:
-                operands = features.float(), grad.float(), rounded.float()
+                operands = features, grad, blocks.weight_for(weight, features.dtype)
                 v_features, v_weight = blocks.gradients(*operands, ctx.kernel_map, (for_features, for_weight))
-                v_features = None if v_features is None else v_features.to(features.dtype)
-                v_weight = None if v_weight is None else v_weight.to(weight.dtype)
-                return v_features, v_weight, None, None
+                return v_features, None if v_weight is None else v_weight.to(weight.dtype), None, None
+            grad, rounded = grad.contiguous(), weight.to(features.dtype)
             if for_features:
                 v_features = _convolve(grad, rounded.transpose(1, 2), ctx.kernel_map.swapped())
             if for_weight:

@@ -18,7 +18,7 @@ from torch.autograd.function import once_differentiable
 
 from sgwarp.kernels.sparse import convolution_block, normalization_block, products_block
 from sgwarp.ops.launcher import counters, launch_blocks, launch_plain, scratch, view
-from sgwarp.ops.sparse.blocks import Running, convolve, gradients, parts_of, rows_of
+from sgwarp.ops.sparse.blocks import Running, convolve, gradients, parts_of, rows_of, typed, types_of
 from sgwarp.ops.sparse.voxels import KernelMap
 
 ROWS, MAX_PARTS = 128, 256  # of a sum over all voxels: rows of a block at least, and blocks at most
@@ -55,11 +55,11 @@ def convolve_and_normalize(
     shortcut: Tensor | None = None,
     beside: Tensor | None = None,
 ) -> tuple[Tensor, Tensor]:
-    """A layer, all of it float32.
+    """A layer in float32, float16 or bfloat16; beside halves weights and normalisation may be float32, and sums are.
 
     Args:
         features: x, [N, C_in].
-        weight: W, [K^3, C_in, C].
+        weight: W, [K^3, C_in, C], of the precision of the normalisation.
         kernel_map: From the N rows to M.
         norm: What follows.
         shortcut: Added before the maximum is taken, [M, C].
@@ -94,14 +94,13 @@ def _infer(
     grid.append(sum(parts_of(n, products_block.CHANNELS) for n in (channels, further)))
     table, mirrored = kernel_map.table(by_target=True)
     nothing, running = features.new_empty(0, 0), norm.running
-    inputs = [view(rows_of(features), wp.float32), view(weight, wp.float32), view(table, wp.int32), int(mirrored)]
+    inputs = [typed(rows_of(features)), typed(weight), view(table, wp.int32), int(mirrored)]
     inputs.append(-1 if kernel_map.identity is None else kernel_map.identity)
-    inputs += [*(view(t, wp.float32) for t in (running.mean, running.variance)), running.epsilon]
-    inputs += [view(t, wp.float32) for t in (norm.gain, norm.bias)]
-    inputs += [view(nothing if shortcut is None else rows_of(shortcut), wp.float32), norm.least]
-    inputs.append(view(nothing if beside is None else rows_of(beside), wp.float32))
-    outputs = [view(z, wp.float32)]
-    launch_blocks(convolution_block.convolve_and_finish_blocks, grid, inputs, outputs, device=z.device)
+    inputs += [typed(running.mean), typed(running.variance), running.epsilon, typed(norm.gain), typed(norm.bias)]
+    inputs += [typed(nothing if shortcut is None else rows_of(shortcut)), norm.least]
+    inputs.append(typed(nothing if beside is None else rows_of(beside)))
+    kernel = convolution_block.make_convolve_and_finish_blocks(*types_of(features, weight))
+    launch_blocks(kernel, grid, inputs, [typed(z)], device=z.device)
     return z
 
 
@@ -121,16 +120,16 @@ def _learn(
             if not changed.is_inference():
                 torch.autograd.graph.increment_version(changed)
     else:
-        inverse = torch.rsqrt(running.variance + running.epsilon)
-        statistics = torch.stack([running.mean, torch.zeros_like(running.mean), inverse])
+        mean, inverse = running.mean.float(), torch.rsqrt(running.variance.float() + running.epsilon)
+        statistics = torch.stack([mean, torch.zeros_like(mean), inverse])
     further = 0 if beside is None else beside.shape[1]
     z = y.new_empty(len(y), y.shape[1] + further)
     nothing = y.new_empty(0, 0)
-    inputs = [view(t, wp.float32) for t in (y, statistics, norm.gain, norm.bias)]
-    inputs += [view(nothing if shortcut is None else rows_of(shortcut), wp.float32), norm.least]
-    inputs.append(view(nothing if beside is None else rows_of(beside), wp.float32))
-    kernel, outputs = normalization_block.normalize_elements, [view(z, wp.float32)]
-    launch_plain(kernel, (z.shape[0], z.shape[1]), inputs, outputs, device=z.device)
+    inputs = [typed(t) for t in (y, statistics, norm.gain, norm.bias)]
+    inputs += [typed(nothing if shortcut is None else rows_of(shortcut)), norm.least]
+    inputs.append(typed(nothing if beside is None else rows_of(beside)))
+    kernel = normalization_block.make_normalize_elements(*types_of(y, norm.gain))
+    launch_plain(kernel, (z.shape[0], z.shape[1]), inputs, [typed(z)], device=z.device)
     return z, y, statistics
 
 
@@ -161,24 +160,23 @@ class _Layer(torch.autograd.Function):
         features, weight, gain, y, statistics, z = ctx.saved_tensors
         for_features, for_weight, for_gain, for_bias, for_shortcut, for_beside = ctx.needs_input_grad[:6]
         channels, grad = y.shape[1], rows_of(grad)
-        v_bias, v_gain = ((y.new_empty if len(y) else y.new_zeros)(channels) for _ in range(2))
-        known = [view(grad, wp.float32), view(z, wp.float32), int(ctx.rectified)]
-        known += [view(t, wp.float32) for t in (y, statistics)]
+        v_bias, v_gain = ((gain.new_empty if len(y) else gain.new_zeros)(channels) for _ in range(2))
+        known, types = [typed(grad), typed(z), int(ctx.rectified), typed(y), typed(statistics)], types_of(y, gain)
         if len(y) and (ctx.learns or for_gain or for_bias):
             per_part = max(ROWS, parts_of(len(y), MAX_PARTS))
             grid = [parts_of(len(y), per_part), parts_of(channels, products_block.CHANNELS)]
             partial = scratch("sparse sums", 2 * grid[0] * channels, torch.float64, y.device)
             inputs = [*known, per_part, view(partial, wp.float64), view(counters(grid[1], y.device), wp.int32)]
-            kernel, outputs = normalization_block.sum_normalized_blocks, [view(t, wp.float32) for t in (v_bias, v_gain)]
-            launch_blocks(kernel, grid, inputs, outputs, device=y.device)
+            kernel = normalization_block.make_sum_normalized_blocks(*types)
+            launch_blocks(kernel, grid, inputs, [typed(v_bias), typed(v_gain)], device=y.device)
         v_features = v_weight = v_shortcut = None
         if for_features or for_weight or for_shortcut:
             v_y = torch.empty_like(y)
             v_shortcut = torch.empty_like(y) if for_shortcut else None
             share = 1.0 / len(y) if ctx.learns else 0.0
-            inputs = [*known, *(view(t, wp.float32) for t in (gain, v_bias, v_gain)), share]
-            outputs = [view(t, wp.float32) for t in (v_y, y.new_empty(0, 0) if v_shortcut is None else v_shortcut)]
-            kernel = normalization_block.normalize_backward_elements
+            inputs = [*known, *(typed(t) for t in (gain, v_bias, v_gain)), share]
+            outputs = [typed(t) for t in (v_y, y.new_empty(0, 0) if v_shortcut is None else v_shortcut)]
+            kernel = normalization_block.make_normalize_backward_elements(*types)
             launch_plain(kernel, (len(y), channels), inputs, outputs, device=y.device)
             wanted = for_features, for_weight
             v_features, v_weight = gradients(features, v_y, weight, ctx.kernel_map, wanted, through)

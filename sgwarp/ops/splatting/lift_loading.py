@@ -15,7 +15,7 @@ from sgwarp.ops.splatting.wide_lifting import LEAST_SLICES
 
 
 def load_lifting(device: torch.device, channels: int, *, ids: bool, squared: bool) -> None:
-    """Load what lifting by the weights of pixels on the CPU needs; with an empty cache, compile it on all threads.
+    """Load what lifting by the weights of pixels on the CPU needs; with an empty cache, compile it on several threads.
 
     Args:
         device: Where the scene lies; on CUDA kernels are loaded one by one.
@@ -23,8 +23,12 @@ def load_lifting(device: torch.device, channels: int, *, ids: bool, squared: boo
         ids: It is a map of ids.
         squared: The weights are squared.
     """
-    if device.type != "cpu":
-        return
+    if device.type == "cpu":
+        load_together(lifting_kernels(channels, ids=ids, squared=squared))
+
+
+def lifting_kernels(channels: int, *, ids: bool, squared: bool) -> list[wp.Kernel]:
+    """Kernels of `load_lifting`, one of each module."""
     if ids:
         kernels: list[wp.Kernel] = [lanes.make_lift_ids(squared)]
     elif channels > LANES * (LEAST_SLICES - 1):
@@ -32,5 +36,4 @@ def load_lifting(device: torch.device, channels: int, *, ids: bool, squared: boo
         kernels += [lanes_wide.sum_tiles, *(lanes.make_lift_dense(1, squared) for _ in pass_widths(channels)[1:])]
     else:
         kernels = [lanes.make_lift_dense(width, squared) for width in pass_widths(channels)]
-    shared_by_all = [shared.sum_rows, binning_lanes.count_tiles]
-    load_together([kernels[0], projection_lanes.project_groups, *kernels[1:], *shared_by_all])
+    return [*kernels, projection_lanes.project_groups, shared.sum_rows, binning_lanes.count_tiles]

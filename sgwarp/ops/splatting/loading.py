@@ -1,7 +1,4 @@
-"""Loading kernels side by side, before the first of them is asked for.
-
-The longest come first, and one of each set of compiler options: modules that share them share compiled headers.
-"""
+"""Loading kernels side by side, before the first of them is asked for."""
 
 from __future__ import annotations
 
@@ -25,7 +22,7 @@ WIDE_PASS = 4  # slices of 16 channels that one walk over the tiles takes; more 
 def load_rendering(
     device: torch.device, *, harmonics: bool, depth: bool, backward: bool = False, absolute: bool = False
 ) -> None:
-    """Load what compositing three channels on the CPU needs; with an empty cache, compile it on all threads.
+    """Load what compositing three channels on the CPU needs; with an empty cache, compile it on several threads.
 
     Args:
         device: Where the scene lies; on CUDA kernels are loaded one by one.
@@ -34,23 +31,32 @@ def load_rendering(
         backward: A backward pass follows.
         absolute: And it adds up magnitudes.
     """
-    if device.type != "cpu":
-        return
-    colors = make_composite_colors(depth, backward)
-    needed: list[wp.Kernel] = [make_composite_backward(False, depth, absolute) if backward else colors]
-    # Both kernels of the projection are in one module.
-    needed += [projection_lanes.project_groups, colors] + [evaluate_harmonics] * harmonics + [binning_lanes.count_tiles]
-    needed += [sum_used_rows] * backward + [harmonics_backward] * (harmonics and backward)
-    load_together(needed)
+    if device.type == "cpu":
+        load_together(rendering_kernels(harmonics=harmonics, depth=depth, backward=backward, absolute=absolute))
 
 
 def load_wide_rendering(device: torch.device, channels: int, *, depth: bool) -> None:
     """Load what compositing more than three channels on the CPU needs, without a backward pass."""
-    if device.type != "cpu":
-        return
-    first, *others = (make_composite_features(width, False) for width in pass_widths(channels))
-    needed: list[wp.Kernel] = [first, projection_lanes.project_groups, *others]
-    load_together([*needed, *[make_composite_colors(True, False)] * depth, binning_lanes.count_tiles])
+    if device.type == "cpu":
+        load_together(wide_rendering_kernels(channels, depth=depth))
+
+
+def rendering_kernels(
+    *, harmonics: bool, depth: bool, backward: bool = False, absolute: bool = False
+) -> list[wp.Kernel]:
+    """Kernels of `load_rendering`, one of each module."""
+    colors = make_composite_colors(depth, backward)
+    needed: list[wp.Kernel] = [make_composite_backward(False, depth, absolute)] * backward
+    # Both kernels of the projection are in one module.
+    needed += [projection_lanes.project_groups, colors] + [evaluate_harmonics] * harmonics + [binning_lanes.count_tiles]
+    return needed + [sum_used_rows] * backward + [harmonics_backward] * (harmonics and backward)
+
+
+def wide_rendering_kernels(channels: int, *, depth: bool) -> list[wp.Kernel]:
+    """Kernels of `load_wide_rendering`."""
+    needed: list[wp.Kernel] = [make_composite_features(width, False) for width in pass_widths(channels)]
+    needed += [projection_lanes.project_groups, binning_lanes.count_tiles]
+    return needed + [make_composite_colors(True, False)] * depth
 
 
 def pass_widths(channels: int) -> list[int]:

@@ -1,6 +1,7 @@
 """Projection tables made by kernels against those made in torch, which are tested against gsplat and float64."""
 
 import math
+from dataclasses import replace
 
 import pytest
 import torch
@@ -8,6 +9,7 @@ import torch
 from sgwarp.ops.planar.harmonics import harmonics_sum
 from sgwarp.ops.planar.projection import ProjectionSettings, project_splats
 from sgwarp.ops.planar.tables import ShadeTable, read_camera
+from sgwarp.scene import Gaussians
 
 COLUMNS = ("means2d", "depths", "conics", "factors", "compensations")
 
@@ -76,6 +78,37 @@ def test_tables_of_kernels_are_those_of_torch(scene, compensated):
         assert (error <= bound).all(), f"{name}: {(error / bound).max():.1f} times its bound"
 
 
+def test_a_compensation_that_is_held_has_no_gradient(make_scene):
+    """Points and lines without area among others, whose opacities are held at half a percent; float64 in torch."""
+    _, gaussians, camera = make_scene("random_cloud")
+    count = len(gaussians)
+    scales = gaussians.scales.clone()
+    scales[: count // 3] *= 1e-4
+    scales[count // 3 : count // 2, 1:] = 0.0
+    gaussians = replace(gaussians, scales=scales, opacities=torch.full((count,), 0.95))
+    doubled = Gaussians.unchecked(
+        *(getattr(gaussians, name).double() for name in ("means", "quats", "scales", "opacities", "sh"))
+    )
+    settings = ProjectionSettings(near=0.2, compensated=True, min_area_ratio=2.5e-5)
+    (mine, here), (exact, there) = (
+        projected(scene, camera, settings, kernels) for scene, kernels in ((gaussians, True), (doubled, False))
+    )
+    assert torch.equal(mine.index, exact.index)
+    torch.testing.assert_close(mine.compensations.double(), exact.compensations, rtol=1e-4, atol=0)
+    held = exact.compensations == math.sqrt(2.5e-5)
+    assert held.sum() > 5
+    assert (~held).sum() > 5
+    weights = torch.linspace(-1, 1, len(held), dtype=torch.float64)
+    found = []
+    for table, leaves in ((mine, here), (exact, there)):
+        found.append(torch.autograd.grad((weights * table.compensations.double()).sum(), leaves))
+    for got, want in zip(*found, strict=True):
+        assert torch.isfinite(got).all()
+        assert want.norm() > 0
+        assert (got - want).norm() <= 1e-4 * want.norm()
+    assert (found[0][2][mine.index[held]] == 0).all()
+
+
 def test_without_opacities_and_with_sparse_gradients(make_scene):
     _, gaussians, camera = make_scene("sh3")
     settings = ProjectionSettings(radius_clip=2.0)
@@ -120,13 +153,12 @@ def test_colors_that_are_not_finite_are_nan_and_have_no_gradient(make_scene):
     assert (means.grad[[2, 4]] == 0).all()
 
 
-@pytest.mark.parametrize("case", ["fisheye", "double", "covariances", "far planes", "skewed", "clamped"])
+@pytest.mark.parametrize("case", ["fisheye", "double", "covariances", "far planes", "skewed"])
 def test_what_kernels_cannot_do_stays_with_torch(case, make_scene):
     _, gaussians, camera = make_scene("odd_size")
     settings = {
         "fisheye": ProjectionSettings("fisheye"),
         "far planes": ProjectionSettings(near=-1.0),
-        "clamped": ProjectionSettings(compensated=True, min_area_ratio=1e-3),
     }.get(case, ProjectionSettings())
     K, dtype = camera.K.clone(), torch.float64 if case == "double" else torch.float32
     if case == "skewed":

@@ -20,9 +20,22 @@ def keys_of(count: int) -> torch.Tensor:
 
 
 class Layer:
-    """A layer with float32 values, and the same values in float64."""
+    """A layer, and the same values in float64.
 
-    def __init__(self, pairs, channels, shortcut=False, beside=0, epsilon=EPSILON, **how):
+    Features are of `dtype`; weights and normalisation are `parameters`, and the weights rounded as they are read.
+    """
+
+    def __init__(
+        self,
+        pairs,
+        channels,
+        shortcut=False,
+        beside=0,
+        epsilon=EPSILON,
+        dtype=torch.float32,
+        parameters=torch.float32,
+        **how,
+    ):
         generator = torch.Generator().manual_seed(channels[0])
 
         def random(*shape):
@@ -34,6 +47,10 @@ class Layer:
         self.inputs.append(random(pairs.target_count, channels[1]) if shortcut else None)
         self.inputs.append(random(pairs.target_count, beside) if beside else None)
         self.running = [torch.randn(channels[1], generator=generator), torch.rand(channels[1], generator=generator)]
+        types = [dtype, parameters, parameters, parameters, dtype, dtype]
+        pairs_of = zip(self.inputs, types, strict=True)
+        self.inputs = [None if t is None else t.detach().to(kind).requires_grad_() for t, kind in pairs_of]
+        self.running = [t.to(parameters) for t in self.running]
 
     def ours(self):
         """z, and the running statistics afterwards."""
@@ -46,7 +63,9 @@ class Layer:
 
     def oracle(self):
         """z, the running statistics, and the inputs that it was computed of."""
-        inputs = [None if t is None else t.detach().double().requires_grad_() for t in self.inputs]
+        rounded = list(self.inputs)
+        rounded[1] = rounded[1].to(rounded[0].dtype)
+        inputs = [None if t is None else t.detach().double().requires_grad_() for t in rounded]
         x, weight, gain, bias, shortcut, beside = inputs
         running = [tensor.double() for tensor in self.running]
         y = sparse_conv(x, weight, self.pairs, schedule="lanes")
@@ -55,19 +74,21 @@ class Layer:
         z = torch.relu(z) if self.how["rectified"] else z
         return z if beside is None else torch.cat([z, beside], dim=1), running, inputs
 
-    def assert_as_the_oracle(self, bound=BOUND):
+    def assert_as_the_oracle(self, bound=BOUND, flat=1e-4):
         z, running = self.ours()
         expected, expected_running, inputs = self.oracle()
         seed = torch.randn(z.shape, dtype=torch.float64, generator=torch.Generator().manual_seed(9))
-        near = expected.detach().abs() < 1e-4  # where either side of zero may be right
-        seed = torch.where(near, 0.0, seed)
-        mine = torch.autograd.grad((z * seed.float()).sum(), [t for t in self.inputs if t is not None])
+        near = expected.detach().abs() < flat  # where either side of zero may be right
+        seed = torch.where(near, 0.0, seed).to(z.dtype).double()
+        mine = torch.autograd.grad((z * seed.to(z.dtype)).sum(), [t for t in self.inputs if t is not None])
         theirs = torch.autograd.grad((expected * seed).sum(), [t for t in inputs if t is not None])
         found = {"z": (z, expected), "mean": (running[0], expected_running[0])}
         found |= {"variance": (running[1], expected_running[1])}
         found |= {f"gradient {i}": both for i, both in enumerate(zip(mine, theirs, strict=True))}
+        dtypes = {f"gradient {i}": t for i, t in enumerate(t for t in self.inputs if t is not None)}
+        assert z.dtype == self.inputs[0].dtype
         for name, (our, their) in found.items():
-            assert our.dtype == torch.float32
+            assert our.dtype == (z if name == "z" else dtypes.get(name, running[0])).dtype
             assert our.shape == their.shape
             if their.numel():
                 error = (our - their).detach().abs().max() / their.detach().abs().max().clamp(min=1e-30)
@@ -84,6 +105,34 @@ def test_a_layer_is_that_of_torch(rows, channels, shortcut, beside):
     # Without epsilon two rows become -1 and 1, whatever they are: their gradient is epsilon's.
     epsilon = EPSILON if rows > 2 else 1.0
     Layer(kernel_map(keys, keys, 3), channels, shortcut, beside, epsilon).assert_as_the_oracle()
+
+
+@pytest.mark.parametrize("whole", [False, True])
+@pytest.mark.parametrize(("dtype", "bound"), [(torch.bfloat16, 8e-3), (torch.float16, 1e-3)])
+def test_half_precision_is_summed_in_single(dtype, bound, whole):
+    """What is stored is rounded, by 2^-9 in bfloat16 and 2^-11 in float16, a few times over: y, z, the gradient of y.
+
+    Sums of 891 products, and over the rows, add nothing to that.
+    """
+    keys = keys_of(300)
+    parameters = dtype if whole else torch.float32
+    layer = Layer(kernel_map(keys, keys, 3), (33, 40), True, 35, dtype=dtype, parameters=parameters)
+    layer.assert_as_the_oracle(2 * bound, flat=10 * bound)
+    with torch.no_grad():
+        layer.how["learns"] = False
+        z, expected = layer.ours()[0].double(), layer.oracle()[0]
+        assert float((z - expected).abs().max()) < bound * float(expected.abs().max())
+
+
+def test_weights_are_rounded_to_the_precision_of_the_features():
+    """And products are taken of what was rounded: single precision would see 1 + 2^-12."""
+    keys = keys_of(3)
+    norm = Normalization(torch.ones(1), torch.zeros(1), Running(torch.zeros(1), torch.ones(1), 0.0, 0.1), False)
+    weight = torch.full((1, 1, 1), 1 + 2.0**-12)
+    x = torch.tensor([[1.0], [256.0], [3.0]], dtype=torch.bfloat16)
+    with torch.no_grad():
+        z, _ = convolve_and_normalize(x, weight, kernel_map(keys, keys, 1), norm)
+    assert torch.equal(z, x)
 
 
 @pytest.mark.parametrize("rectified", [True, False])

@@ -192,6 +192,7 @@ def test_a_row_of_nan_reaches_its_neighbours_and_nobody_else(channels):
 
 
 @pytest.mark.slow
+@pytest.mark.parametrize("schedule", ["lanes", "block"])
 @pytest.mark.parametrize(
     ("dtype", "bound", "autocast"),
     [
@@ -202,7 +203,7 @@ def test_a_row_of_nan_reaches_its_neighbours_and_nobody_else(channels):
         (torch.float16, 1e-3, True),
     ],
 )
-def test_lower_precision_stays_near_float64(dtype, bound, autocast):
+def test_lower_precision_stays_near_float64(dtype, bound, autocast, schedule):
     """Half precision rounds the inputs and each product (unit roundoff 2^-9 for bfloat16, 2^-11 for float16); the sum
     over 27 offsets adds nothing to that, because it is taken in float32."""
     keys = keys_of(600, 5)
@@ -214,7 +215,7 @@ def test_lower_precision_stays_near_float64(dtype, bound, autocast):
     stored = torch.float32 if autocast else dtype
     low = [t.detach().to(stored).requires_grad_() for t in (features, weight)]
     with torch.autocast("cpu", dtype=dtype, enabled=autocast):
-        y = sparse_conv(*low, pairs)
+        y = sparse_conv(*low, pairs, schedule=schedule)
     assert y.dtype == dtype
     assert largest_difference(y.double(), expected) < bound
     mine = torch.autograd.grad((y.double().square()).sum(), low)

@@ -24,6 +24,7 @@ def render(**changed):
     return sg.rasterize(**(FIELDS | changed), width=16, height=12)
 
 
+@pytest.mark.cpu_only("arrays and lists are of the CPU")
 @pytest.mark.parametrize("convert", [np.asarray, torch.Tensor.tolist])
 def test_arrays_and_lists_are_taken_for_tensors(convert):
     want = render()
@@ -31,6 +32,7 @@ def test_arrays_and_lists_are_taken_for_tensors(convert):
     assert torch.equal(found.features, want.features)
 
 
+@pytest.mark.cpu_only("arrays are of the CPU")
 def test_an_array_that_cannot_be_written_to():
     array = FIELDS["means"].numpy().copy()
     array.flags.writeable = False

@@ -1,37 +1,16 @@
 """What a rendering loads side by side is what it launches: no more, or compiling it would be in vain, and no less."""
 
+import threading
+
 import pytest
 import torch
 import warp as wp
 
 import sgwarp as sg
-from sgwarp.ops import launcher
 from sgwarp.ops.splatting.forward import rasterize
 from sgwarp.ops.splatting.lift_sums import LiftSums
 from sgwarp.ops.splatting.lifting import lift_view
 from sgwarp.scene import FeatureMap
-
-
-@pytest.fixture
-def modules(monkeypatch) -> tuple[set[str], set[str]]:
-    """Names of modules that are loaded together from now on, and of those whose kernels are launched."""
-    loaded: set[str] = set()
-    launched: set[str] = set()
-    load, launch = wp.force_load, wp.launch
-
-    def spy_on_loading(device, *, modules, **options):
-        loaded.update(module.name for module in modules)
-        load(device, modules=modules, **options)
-
-    def spy_on_launching(kernel, *arguments, **options):
-        launched.add(kernel.module.name)
-        return launch(kernel, *arguments, **options)
-
-    monkeypatch.setattr(wp, "force_load", spy_on_loading)
-    monkeypatch.setattr(wp, "launch", spy_on_launching)
-    monkeypatch.setattr(launcher, "_loaded", set())
-    monkeypatch.setattr(launcher, "_thread_count", 2)
-    return loaded, launched
 
 
 @pytest.mark.parametrize("backward", [False, True])
@@ -82,3 +61,23 @@ def test_lifting_loads_what_it_launches(make_scene, modules, mode, channels):
     lift_view(gaussians, camera, found, LiftSums.zeros(len(gaussians), found.channels), mode=mode)
     assert launched
     assert loaded == launched
+
+
+def test_one_thread_loads_what_is_compiled_alike(make_scene, modules, monkeypatch):
+    """Headers are compiled once for each thread and set of options."""
+    threads: dict[str, set[int]] = {}
+    load = wp.force_load
+
+    def spy(device, *, modules, **options):
+        for module in modules:
+            threads.setdefault(module.options["cpu_compiler_flags"], set()).add(threading.get_ident())
+        load(device, modules=modules, **options)
+
+    monkeypatch.setattr(wp, "force_load", spy)
+    _, gaussians, camera = make_scene("random_cloud")
+    for channels in (3, 16, 64):
+        rasterize(gaussians, camera, features=torch.rand(len(gaussians), channels), expected_depth=True)
+    assert len(threads) == 2
+    assert [len(idents) for idents in threads.values()] == [1, 1]
+    first, second = threads.values()
+    assert first.isdisjoint(second)

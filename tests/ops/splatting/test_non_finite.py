@@ -36,6 +36,7 @@ def spoiled(values: dict[str, torch.Tensor], name: str, value: float, row: int =
     return values | {name: changed}
 
 
+@pytest.mark.cpu_only("on CUDA to look is to wait")
 @pytest.mark.parametrize("value", BAD)
 def test_backgrounds_are_refused(value):
     background = torch.tensor([0.0, value, 0.0])
