@@ -95,15 +95,34 @@ def _chunk(head: bytes, position: int, wanted: bytes, order: Any) -> bytes:
 
 def _of_tiff(data: bytes) -> int:
     """The orientation in the first directory of a TIFF structure."""
+    noted = _noted(data)
+    return UPRIGHT if noted is None else noted[0]
+
+
+def without_orientation(data: bytes) -> bytes:
+    """A TIFF file that notes none, so that decoders, some of which turn pixels and some of which do so by half, don't.
+
+    Args:
+        data: The whole file.
+    """
+    noted = _noted(data)
+    if noted is None or noted[0] == UPRIGHT:
+        return data
+    _, place, order = noted
+    return data[:place] + struct.pack(order + "H", UPRIGHT) + data[place + 2 :]
+
+
+def _noted(data: bytes) -> tuple[int, int, str] | None:
+    """Orientation in the first directory of a TIFF structure, its place, and the order of bytes; None if none is."""
     if data[:2] not in (b"II", b"MM") or len(data) < 10:
-        return UPRIGHT
+        return None
     order = "<" if data[:2] == b"II" else ">"
     (start,) = struct.unpack_from(order + "I", data, 4)
     if start + 2 > len(data):
-        return UPRIGHT
+        return None
     (entries,) = struct.unpack_from(order + "H", data, start)
     for entry in range(start + 2, min(start + 2 + 12 * entries, len(data) - 11), 12):
         tag, kind, _, value = struct.unpack_from(order + "HHIH", data, entry)
         if tag == ORIENTATION and kind == 3:
-            return value if 1 <= value <= 8 else UPRIGHT
-    return UPRIGHT
+            return (value, entry + 8, order) if 1 <= value <= 8 else None
+    return None

@@ -59,9 +59,9 @@ def check_image(path: str | os.PathLike[str], data: bytes) -> tuple[int, int]:
     size = image_size(data)
     if size is None:
         kind = next((kind for place, sign, kind in NOT_DECODED if data[place : place + len(sign)] == sign), None)
-        what = (
-            f"is a {kind} image, which is not decoded" if kind else "is not an image of a known format, or is damaged"
-        )
+        what = "is not an image of a known format, or is damaged"
+        if kind:
+            what = f"is {'an' if kind[0] in 'AO' else 'a'} {kind} image, which is not decoded"
         raise InputError(f"{path}: {what}; save it again as PNG or JPEG")
     height, width = size
     limit = largest_image()

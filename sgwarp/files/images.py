@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 from sgwarp.errors import InputError
 from sgwarp.files.access import open_input, read_bytes
 from sgwarp.files.atomic import atomic_path
+from sgwarp.files.exif import without_orientation
 from sgwarp.files.image_headers import (
     JPEG_SIGNATURE,
     PNG_SIGNATURE,
@@ -187,6 +188,8 @@ def _decode(path: str | os.PathLike[str], data: bytes, flags: int) -> NDArray[An
         raise InputError(f"{path}: image is cut short ({len(data)} bytes); copy or download it again")
     if data.startswith(PNG_SIGNATURE):
         data = plain_png(data)  # the decoder takes memory for what other chunks claim
+    elif data[:4] in TIFF_SIGNATURES:
+        data = without_orientation(data)  # the decoder turns TIFF files whatever its flags say
     try:
         pixels = cv2.imdecode(np.frombuffer(data, np.uint8), flags)
     except cv2.error:

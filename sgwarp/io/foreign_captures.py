@@ -16,6 +16,7 @@ CAPTURES = (
     ("poses_bounds.npy", "LLFF's list of poses (poses_bounds.npy)", "to a transforms.json"),
     ("keyframes/cameras/*.json", "a Polycam capture", "ns-process-data polycam"),
     ("EXR_RGBD/metadata.json", "a Record3D capture", "ns-process-data record3d"),
+    ("rgbd/*.depth", "a Record3D capture, unpacked", "ns-process-data record3d, of the .r3d file"),
     ("*.r3d", "a Record3D capture (.r3d)", "ns-process-data record3d"),
     (
         "results/depth*.png",

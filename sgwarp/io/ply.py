@@ -10,6 +10,7 @@ import logging
 import math
 import os
 import re
+from collections import Counter
 from collections.abc import Mapping, Sequence
 from typing import Any
 
@@ -40,6 +41,7 @@ REST_COUNTS = tuple(3 * (k - 1) for k in SH_COUNTS)  # 0, 9, 24, 45
 LOG_ZERO = -110.0
 SAMPLED, COARSE = 16, 0.2  # every so many rows are looked at; steps of float32 that matter [size of a Gaussian]
 MIN_NORM = 1e-3  # a shorter quaternion has no direction; the renderer leaves it out, too
+KNOWN = re.compile(r"[xyz]|n[xyz]|red|green|blue|opacity|scale_\d|rot_\d|f_dc_\d|f_rest_\d+")  # names of columns
 ROWS_PER_BLOCK = 16384  # a block of 62 columns fits the cache, so that rows are fetched from memory once
 
 
@@ -83,8 +85,27 @@ def _parse(path: str | os.PathLike[str], source: str | io.BytesIO) -> Elements:
         raise
     except (plyfile.PlyParseError, ArithmeticError, LookupError, MemoryError, TypeError, ValueError) as error:
         reason = " ".join(str(error).split()) or type(error).__name__
+        if unknown := re.search(r"line (\d+): field type '(.*?)' not in", reason):
+            raise InputError(
+                f"{path}: line {unknown[1]} of its header has the type {unknown[2][:40]!r}, which PLY does not know; "
+                "write these numbers as float"
+            ) from None
         raise InputError(f"{path}: is not a valid PLY file ({reason})") from None
-    return {element.name: _loaded(path, element.data) for element in content.elements}
+    elements = {element.name: _loaded(path, element.data) for element in content.elements}
+    return elements | {"vertex": _in_lower_case(elements["vertex"])} if "vertex" in elements else elements
+
+
+def _in_lower_case(rows: Any) -> Any:
+    """Rows whose known columns are called as usual: some programs write X, Y, Z and Opacity."""
+    names = rows.dtype.names or ()
+    folded = Counter(name.lower() for name in names)
+    usual = {name: name.lower() for name in names if folded[name.lower()] == 1 and KNOWN.fullmatch(name.lower())}
+    renamed = [usual.get(name, name) for name in names]
+    if renamed == list(names) or rows.dtype.hasobject:
+        return rows
+    kinds, places = zip(*((rows.dtype.fields[name][0], rows.dtype.fields[name][1]) for name in names), strict=True)
+    described: Any = {"names": renamed, "formats": kinds, "offsets": places, "itemsize": rows.dtype.itemsize}
+    return rows.view(np.dtype(described))
 
 
 def _loaded(path: str | os.PathLike[str], rows: NDArray[Any]) -> NDArray[Any]:

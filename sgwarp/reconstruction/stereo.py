@@ -17,6 +17,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sgwarp.ops.launcher import get_threads
+from sgwarp.reconstruction.stereo_agreement import UNSEEN, WINDOW, difference, least, together
+from sgwarp.reconstruction.stereo_refinement import refined
+from sgwarp.reconstruction.stereo_smoothing import smoothed
 from sgwarp.runs.progress import Report
 from sgwarp.scene import Camera
 
@@ -28,10 +31,6 @@ RATIO = 1.055  # between the depths of two planes
 RANKS = (0, 1, 2, 4, 7, 11)  # of the neighbors among those that look the same way, by distance
 LEAST_BASELINE = 0.02  # of a neighbor [extent of the cameras]
 LEAST_COSINE = 0.6  # between the directions of view of two neighbors
-WINDOW = 5  # that is compared [pixels]
-NOISE = 2e-3  # deviation of brightness that counts as even, in [0, 1]
-EVEN_WEIGHT = 3.0  # of the difference of brightness, beside 1 - correlation
-UNSEEN = 2.0  # cost where fewer than two neighbors see a pixel
 AGREE, BEYOND = 0.04, 0.12  # relative differences of depth that confirm a point, and that contradict it
 LEAST_CONFIRMED = 2  # other photographs
 
@@ -84,7 +83,8 @@ def estimate_depth(
 
     def depth_of(index: int) -> Array:
         others = [(gray[other], cameras[other]) for other in neighbors[index]]
-        return _best(_costs(gray[index], cameras[index], others, planes), planes)
+        depth = _best(smoothed(_costs(gray[index], cameras[index], others, planes)), planes)
+        return refined(depth, gray[index], cameras[index], others)
 
     depths: list[Array] = []
     with ThreadPoolExecutor(get_threads()) as pool:  # NumPy and OpenCV let go of the interpreter
@@ -127,32 +127,15 @@ def choose_neighbors(cameras: Sequence[Camera], extent: float) -> list[list[int]
 
 def _costs(image: Array, camera: Camera, others: Sequence[tuple[Array, Camera]], planes: Array) -> Array:
     """Disagreement with the better half of the neighbors, for each plane, float32 [D, h, w]."""
-    import cv2
-
-    size = (WINDOW, WINDOW)
-    mean = cv2.blur(image, size)
-    spread = cv2.blur(image * image, size) - mean * mean
+    if not others:
+        return np.full((len(planes), *image.shape), UNSEEN, np.float32)
     costs = np.full((len(others), len(planes), *image.shape), np.inf, np.float32)
     for number, (other, its_camera) in enumerate(others):
         for level, depth in enumerate(planes):
             warped = _warp(other, its_camera, camera, depth)
-            if warped is None:
-                continue
-            its_mean = cv2.blur(warped, size)
-            its_spread = cv2.blur(warped * warped, size) - its_mean * its_mean
-            joint = cv2.blur(warped * image, size) - its_mean * mean
-            scale = np.sqrt((spread + NOISE**2).clip(NOISE**2) * (its_spread + NOISE**2).clip(NOISE**2))
-            cost = 1.0 - joint / scale + EVEN_WEIGHT * np.abs(its_mean - mean)
-            cost[its_mean < 0] = np.inf  # the window reaches beyond the neighbor's border
-            costs[number, level] = cost
-    if not others:
-        return np.full((len(planes), *image.shape), UNSEEN, np.float32)
-    seen = np.isfinite(costs).sum(axis=0)
-    half = np.maximum((seen + 1) // 2, 1)
-    costs.sort(axis=0)
-    within = np.arange(len(others))[:, None, None, None] < half
-    total = np.where(within & np.isfinite(costs), costs, 0).sum(axis=0) / half
-    return np.where(seen >= min(2, len(others)), total, np.float32(UNSEEN))
+            if warped is not None:
+                costs[number, level] = difference(image, warped)
+    return together(costs)
 
 
 def _warp(other: Array, its_camera: Camera, camera: Camera, depth: float) -> Array | None:
@@ -176,12 +159,8 @@ def _warp(other: Array, its_camera: Camera, camera: Camera, depth: float) -> Arr
 
 
 def _best(costs: Array, planes: Array) -> Array:
-    """Depth of the least cost of each pixel, between the planes by a parabola, float32 [h, w]."""
-    level = costs.argmin(axis=0).clip(1, len(planes) - 2)
-    before, least, after = (np.take_along_axis(costs, (level + step)[None], axis=0)[0] for step in (-1, 0, 1))
-    bend = before - 2 * least + after
-    offset = np.where(bend > 1e-6, 0.5 * (before - after) / np.where(bend > 1e-6, bend, 1), 0).clip(-0.5, 0.5)
-    return (planes[level] * RATIO**offset).astype(np.float32)
+    """Depth of the least cost of each pixel, float32 [h, w]."""
+    return (planes[len(planes) // 2] * RATIO ** least(costs)).astype(np.float32)
 
 
 def unproject(camera: Camera, depth: Array) -> Array:

@@ -22,7 +22,7 @@ LARGEST = 1600  # photographs are made this small for features [pixels]
 # At most 8192 features a photograph, of 24 bytes and 128 of their descriptor; of a pair as many matches, 8 bytes each,
 # stored twice: as found, and as checked.
 PHOTOGRAPH_BYTES, PAIR_BYTES = 8192 * 152, 2 * 8192 * 8
-SMALL, FAINT = 1000, 0.003  # photographs whose sides are shorter have few features: fainter ones count, too [pixels]
+SMALL, FAINT = 1000, 0.0015  # photographs whose sides are shorter have few features: fainter ones count, too [pixels]
 
 
 @dataclass(frozen=True)

@@ -43,6 +43,8 @@ BESIDE = frozenset(("mask", "depth", "label", "semantic", "normal", "confidence"
 BEGINNINGS, ENDINGS = ("mask_", "dynamic_mask_", "depth_"), ("_mask", ".mask", "-mask", "_depth")
 FEW_FEATURES = 200  # in a photograph: blurred, dark, or of something even
 FEW_MATCHES = 30  # with any other photograph
+OUTLIER = 0.5  # error of a feature from which on it counts less and less in the last adjustment [pixels]
+ADJUSTMENTS = 200  # steps of it at most
 LEAST_ANGLE = 4.0  # between the first two photographs where none have COLMAP's 16 [degrees]
 
 
@@ -150,6 +152,7 @@ def estimate_poses(
     extract_features(database, folder, readable, settings, report)
     match_features(database, choose_pairs(readable, settings.matching), settings, report)
     model = _map(database, folder, out, settings, len(readable), report)
+    _adjust(model, settings, database)
     found = Registration(
         tuple(sorted(model.image(number).name for number in model.reg_image_ids())),
         {},
@@ -237,6 +240,29 @@ def _attempt(database: Path, folder: Path, work: Path, options: Any, count: int,
     models = run_cancellable(database, run, lambda: report(min(placed, count), count, "placing photographs"))
     shutil.rmtree(work, ignore_errors=True)
     return models
+
+
+def _adjust(model: Any, settings: SfmSettings, database: Path) -> None:
+    """Adjust all poses, the cameras and the points once more, so that wrong matches do not pull.
+
+    The mapper minimizes squared errors, and keeps what is up to 4 pixels off. Cauchy's loss leaves such features next
+    to no weight.
+    """
+    pycolmap = require_pycolmap()
+    options = pycolmap.BundleAdjustmentOptions()
+    options.print_summary = False
+    options.ceres.loss_function_type = pycolmap.LossFunctionType.CAUCHY
+    options.ceres.loss_function_scale = OUTLIER
+    options.ceres.solver_options.max_num_iterations = ADJUSTMENTS
+    options.ceres.solver_options.num_threads = settings.threads
+    every = pycolmap.BundleAdjustmentConfig()
+    for number in model.reg_image_ids():
+        every.add_image(number)
+    every.fix_gauge(pycolmap.BundleAdjustmentGauge.TWO_CAMS_FROM_WORLD)
+    # pycolmap.bundle_adjustment would do the same, and write to the terminal whatever the level of its log is.
+    adjuster = pycolmap.create_default_bundle_adjuster(options, every, model)
+    run_cancellable(database, lambda token: adjuster.solve())
+    model.update_point_3d_errors()
 
 
 def _reasons(
