@@ -192,7 +192,9 @@ def test_a_record_belongs_to_its_files(data, tmp_path):
 
 def test_rows_of_an_ablation_for_machines(data):
     settings = Settings()
-    found = Evaluation(data.profile, settings, [SceneResult("a", seconds={"lift": 3.0, "read": 1.0})], figures={"x": 1.0})
+    found = Evaluation(
+        data.profile, settings, [SceneResult("a", seconds={"lift": 3.0, "read": 1.0})], figures={"x": 1.0}
+    )
     variant = Variant("views", "50 %", "views_0.5", settings)
     trials = [Trial(variant, found, "", 0.5), Trial(replace(variant, value="20 %"), None, "odd")]
     first, second = as_rows(Ablation(data.profile, trials))
