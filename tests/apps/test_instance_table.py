@@ -7,9 +7,11 @@ import pytest
 import torch
 
 from sgwarp.apps.instances import evidence as evidence_module
+from sgwarp.apps.instances import maps
 from sgwarp.apps.instances.description import GroupFacts, describe, find_doubts
 from sgwarp.apps.instances.evidence import ViewEvidence, gather_evidence
 from sgwarp.apps.instances.finder import _called, find, join_evidence
+from sgwarp.apps.instances.maps import draw_ids
 from sgwarp.apps.instances.settings import InstanceSettings
 from sgwarp.commands.instances import LISTED, listing
 from sgwarp.encoders.base import MissingMap
@@ -228,3 +230,24 @@ def test_the_listing_line_by_line():
     assert lines[-1] == "2 smaller ones are in the table"
     few = replace(found, table=tuple(rows[:LISTED]))
     assert len(listing(few).splitlines()) == 1 + LISTED
+
+
+def test_the_legend_has_the_colors_of_the_picture(monkeypatch):
+    """The largest first, by their ids and labels; what belongs to none has no color."""
+    rows = [Instance(k, "default", 0, 9, 1, 1, 1.0, ZERO, FORWARD, ZERO, label) for k, label in enumerate("abcd", 1)]
+    found = InstanceMap(torch.zeros(1, 0, 1), torch.zeros(1, 0, 1), torch.zeros(0), tuple(rows), ("default",), "x")
+    ids = torch.zeros(8, 12, dtype=torch.int64)
+    ids[0:2], ids[2:6], ids[6] = 4, 1, 3
+    seen = []
+    monkeypatch.setattr(maps, "with_legend", lambda *given: seen.append(given))
+    draw_ids(torch.zeros(8, 12, 3), ids, found)
+    ((picture, names, colors),) = seen
+    assert names == ["1 a", "4 d", "3 c"]
+    for color, number in zip(colors, (1, 4, 3), strict=True):
+        shown = picture[ids.numpy() == number].reshape(-1, 3)
+        np.testing.assert_allclose(shown, np.broadcast_to(0.6 * color, shown.shape), atol=1)  # over black
+    assert not picture[ids.numpy() == 0].any()
+    assert len({tuple(color) for color in colors.tolist()}) == 3
+    monkeypatch.setattr(maps, "LINES", 2)
+    draw_ids(torch.zeros(8, 12, 3), ids, found)
+    assert seen[1][1] == ["1 a", "4 d"]
