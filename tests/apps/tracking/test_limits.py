@@ -11,6 +11,7 @@ import torch
 from sgwarp.apps.tracking import answers
 from sgwarp.apps.tracking.answers import Questions, answer
 from sgwarp.apps.tracking.association import Associated
+from sgwarp.apps.tracking.facts import sequence_facts
 from sgwarp.apps.tracking.fusion import Evidence, Fusion, FusionSettings
 from sgwarp.apps.tracking.points import carry_points
 from sgwarp.apps.tracking.state import FeatureStore, load_state, read_features, save_state
@@ -18,6 +19,7 @@ from sgwarp.apps.tracking.tracker import TrackedFrame, Tracker, _Plain
 from sgwarp.errors import InputError
 from sgwarp.files.torch_files import load_torch, save_torch
 from sgwarp.io.moving_views import FrameView
+from sgwarp.io.sequences import Frame
 from sgwarp.ops.splatting.lifting import LiftSums
 from sgwarp.scene import FeatureMap, Gaussians
 
@@ -318,3 +320,29 @@ def test_foreground_needs_a_column(stage):
     tracker.settings = replace(tracker.settings, foreground=True)
     with pytest.raises(InputError, match="frame 2: the scene has no seg_colors that tell foreground"):
         tracker._tracked(SimpleNamespace(foreground=None, index=2), stage.gaussians, [], evidence(), None)
+
+
+def test_facts_compare_gaussians_of_one_identity():
+    """Of ids 7, 3 and 5 the second frame has 5, 9 and 7: 7 moves by two meters, 5 stays, 9 has no partner."""
+
+    def moment(index, ids, places):
+        means = torch.tensor(places)[:, None] * torch.tensor([[1.0, 0.0, 0.0]])
+        quats, count = torch.tensor([[1.0, 0.0, 0.0, 0.0]]), len(ids)
+        shape = (quats.expand(count, 4), torch.ones(count, 3), torch.ones(count), torch.zeros(count, 1, 3))
+        return Frame(index, Gaussians(means, *shape), torch.tensor(ids), torch.tensor([True, False, True]))
+
+    frames = [moment(0, [7, 3, 5], [0.0, 1.0, 4.0]), moment(1, [5, 9, 7], [4.0, 50.0, 2.0])]
+
+    class Frames:
+        def __len__(self):
+            return 2
+
+        def frame(self, index):
+            return frames[index]
+
+    facts = sequence_facts(Frames())
+    assert (facts["frames"], facts["gaussians"], facts["identity"]) == (2, 3, "ids")
+    assert facts["moving_share"] == pytest.approx(0.5)
+    assert (facts["median_step"], facts["largest_step"]) == (2.0, 2.0)
+    assert facts["foreground_share"] == pytest.approx(2 / 3)
+    assert facts["non_finite_rows"] == 0
