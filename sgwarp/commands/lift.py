@@ -20,7 +20,17 @@ if TYPE_CHECKING:
     from sgwarp.viewer.live import Live
     from sgwarp.viewer.workbench import Workbench
 
-OF_VIEWS = ("transform", "cache", "cache_limit", "mode", "tau", "border", "passes", "ridge", "iterations")
+OF_VIEWS: tuple[str, ...] = (
+    "transform",
+    "cache",
+    "cache_limit",
+    "mode",
+    "tau",
+    "border",
+    "passes",
+    "ridge",
+    "iterations",
+)
 OF_VIEWS += ("reliability", "fill", "share_of_views", "photographs", "deterministic", "images", "view")
 
 

@@ -157,6 +157,16 @@ def test_iou_and_shared_mass_are_thresholds():
     assert len(set(join_masks(faint, InstanceSettings(least_shared=0.06)).tolist())) == 2
 
 
+@pytest.mark.parametrize("order", [1, -1])
+def test_what_is_shared_is_a_share_of_the_smaller_mask(order):
+    """0.3 of masks of mass 1 and 3, of which each view shows 0.4 of the other: IoU 0.6, share 0.3 and not 0.1."""
+    visible = np.array([[1.0, 0.4], [0.4, 3.0]])[::order, ::order]
+    graph = MaskGraph(np.array([0]), np.array([1]), np.array([0.3]), visible, np.array([0, 1]))
+    for least, groups in ((0.29, 1), (0.31, 2)):
+        found = join_masks(graph, InstanceSettings(least_shared=least))
+        assert len(set(found.tolist())) == groups
+
+
 def test_features_can_forbid():
     graph = graph_of({(0, 1): 0.9}, [0, 1])
     other = MaskGraph(graph.first, graph.second, graph.shared, graph.visible, graph.view_of, np.eye(2))

@@ -1,10 +1,13 @@
 """What the helpers that commands share pass on: settings of poses, and which encoder of phrases is asked for."""
 
+import numpy as np
 import pytest
 
+from sgwarp.cli import main
 from sgwarp.io.store import save_semantics
 from sgwarp.lifting.lifter import lift
 from sgwarp.reconstruction.sfm.features import SfmSettings
+from sgwarp.reconstruction.sfm.triangulation import LEAST_POINTS
 
 ESTIMATE = "sgwarp.reconstruction.sfm.poses.estimate_poses"
 POSES = {
@@ -88,3 +91,40 @@ def test_phrases_are_for_the_encoder_of_the_lift_or_the_one_that_is_named(stoppe
     assert all(templates is None for templates in call[3:])
     if name != "instances":
         assert stopped(target, *words, "--encoder", "clip:other").positional[:3] == ("toy", "clip:other", "cpu")
+
+
+# How a folder of photographs says where its cameras stood; each is fitted as it is, and no poses are looked for.
+POSED = {
+    "transforms": ("transforms.json",),
+    "transforms of a split": ("transforms_train.json",),
+    "COLMAP": ("sparse/0/cameras.bin", "sparse/0/images.bin"),
+    "COLMAP as text, beside the photographs": ("cameras.txt", "images.txt"),
+    "COLMAP in a folder of its own": ("colmap/sparse/0/cameras.bin", "colmap/sparse/0/images.bin"),
+}
+
+
+@pytest.mark.parametrize("name", [*POSED, "photographs alone"])
+def test_a_fit_looks_for_poses_where_there_are_none(stopped, tmp_path, name):
+    views = tmp_path / "room"
+    for file in ("images/0001.png", *POSED.get(name, ())):
+        (views / file).parent.mkdir(parents=True, exist_ok=True)
+        (views / file).touch()
+    target = "sgwarp.io.views.load_views" if name in POSED else "sgwarp.commands.fit.find_poses"
+    assert stopped(target, "fit", views, "--out", tmp_path / "s.ply").positional[0] == views
+
+
+@pytest.mark.parametrize("init", ["auto", "triangulated"])
+@pytest.mark.parametrize("more", [-1, 0])
+def test_few_triangulated_points_are_no_start(stopped, stage_files, tmp_path, monkeypatch, capsys, caplog, init, more):
+    count = LEAST_POINTS + more
+    points = np.zeros((count, 3)), np.zeros((count, 3))
+    monkeypatch.setattr("sgwarp.reconstruction.sfm.library.has_pycolmap", lambda: True)
+    monkeypatch.setattr("sgwarp.reconstruction.sfm.triangulation.triangulate", lambda *arguments: points)
+    arguments = ["fit", stage_files.views, "--out", tmp_path / "s.ply", "--init", init]
+    if more < 0 and init == "triangulated":
+        assert main([str(argument) for argument in arguments]) == 2
+        assert f"only {count} points fit the poses" in capsys.readouterr().err
+        return
+    start = stopped("sgwarp.reconstruction.fitting.trainer.fit", *arguments).positional[1]
+    assert start is (None if more < 0 else points)
+    assert (f"only {count} can be triangulated" in caplog.text) == (more < 0)

@@ -6,7 +6,15 @@ import torch
 from torch.nn.functional import interpolate, normalize
 
 from sgwarp.encoders.base import Instances, MapSource, Masks, TextEncoder, require_same_space
-from sgwarp.encoders.compose import Crops, MaskedImages, PaintedInstances, PlainPixels, RefinedPixels, box_masks
+from sgwarp.encoders.compose import (
+    Crops,
+    MaskedImages,
+    PaintedInstances,
+    PlainPixels,
+    RefinedPixels,
+    box_masks,
+    combine_masks,
+)
 from sgwarp.encoders.regions import cut_squares
 from sgwarp.errors import InputError
 
@@ -327,3 +335,18 @@ def test_a_cached_map_depends_on_the_files_of_its_masks(view, rule):
     assert source.cache_key(view) == before
     generator.content = "other"
     assert source.cache_key(view) != before
+
+
+def test_masks_of_several_scales_have_the_size_of_the_first():
+    """One pixel of the smaller map is four of the larger; scores and ranks follow their masks."""
+    large, small = torch.zeros(1, 4, 6, dtype=torch.bool), torch.zeros(2, 2, 3, dtype=torch.bool)
+    large[0, 3, 5] = small[0, 0, 2] = small[1, 1, 0] = True
+    first = Masks(large, torch.tensor([0.9]), torch.tensor([2]))
+    second = Masks(small, torch.tensor([0.5, 0.4]), torch.tensor([0, 1]))
+    found = combine_masks([first, second])
+    assert (found.masks.shape, found.scores.tolist()) == ((3, 4, 6), pytest.approx([0.9, 0.5, 0.4]))
+    assert found.ranks.tolist() == [2, 0, 1]
+    assert torch.equal(found.masks[0], large[0])
+    assert found.masks[1].nonzero().tolist() == [[0, 4], [0, 5], [1, 4], [1, 5]]
+    assert found.masks[2].nonzero().tolist() == [[2, 0], [2, 1], [3, 0], [3, 1]]
+    assert combine_masks([second, first]).masks.shape == (3, 2, 3)

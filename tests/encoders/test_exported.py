@@ -152,6 +152,37 @@ def test_damaged_instances(tmp_path, view, image, content, message):
         VLPartFiles(tmp_path).find(view, image)
 
 
+@pytest.mark.parametrize("name", ["boxes", "names", "scores"])
+def test_arrays_of_instances_that_are_missing(tmp_path, view, image, name):
+    arrays = {"boxes": np.array([[0.0, 0, 5, 5]]), "names": np.array(["a"]), "scores": np.array([1.0])}
+    del arrays[name]
+    np.savez(tmp_path / "a.npz", **arrays)
+    with pytest.raises(InputError, match=rf"a\.npz: lacks the array {name}"):
+        VLPartFiles(tmp_path).find(view, image)
+
+
+@pytest.mark.parametrize("name", ["boxes", "names", "scores"])
+def test_arrays_of_instances_that_are_odd(tmp_path, view, image, name):
+    arrays = {"boxes": np.array([[0.0, 0, 5, 5]]), "names": np.array(["a"]), "scores": np.array([1.0])}
+    odd = {"boxes": np.array([["x"] * 4]), "names": np.array(5), "scores": np.array(["x"])}
+    np.savez(tmp_path / "a.npz", **{**arrays, name: odd[name]})
+    message = {"names": r"names \[K\] must be texts"}.get(name, r"must be numbers")
+    with pytest.raises(InputError, match=message):
+        VLPartFiles(tmp_path).find(view, image)
+
+
+def test_instances_of_which_some_have_masks(tmp_path, view, image):
+    row = {"box": [0, 0, 1, 1], "name": "a", "score": 1}
+    masked = {**row, "mask": {"size": [2, 2], "counts": [4]}}
+    for rows, message in (
+        ([row, masked], "1 of 2 instances have a mask"),
+        ([masked, {**masked, "mask": {"size": [4, 4], "counts": [16]}}], "masks differ in size"),
+    ):
+        (tmp_path / "a.json").write_text(json.dumps({"instances": rows}))
+        with pytest.raises(InputError, match=message):
+            VLPartFiles(tmp_path).find(view, image)
+
+
 def test_missing_instances(tmp_path, view, image):
     with pytest.raises(InputError, match="no such folder"):
         VLPartFiles(tmp_path / "none")

@@ -153,7 +153,7 @@ def test_colors_that_are_not_finite_are_nan_and_have_no_gradient(make_scene):
     assert (means.grad[[2, 4]] == 0).all()
 
 
-@pytest.mark.parametrize("case", ["fisheye", "double", "covariances", "far planes", "skewed"])
+@pytest.mark.parametrize("case", ["fisheye", "double", "covariances", "far planes", "skewed", "lens"])
 def test_what_kernels_cannot_do_stays_with_torch(case, make_scene):
     _, gaussians, camera = make_scene("odd_size")
     settings = {
@@ -163,6 +163,7 @@ def test_what_kernels_cannot_do_stays_with_torch(case, make_scene):
     K, dtype = camera.K.clone(), torch.float64 if case == "double" else torch.float32
     if case == "skewed":
         K[0, 1] = 3.0
+    K.requires_grad_(case == "lens")
     shape = {"quats": gaussians.quats.to(dtype), "scales": gaussians.scales.to(dtype)}
     if case == "covariances":
         shape = {"covars": torch.eye(3).expand(len(gaussians), 3, 3) * 0.01}
@@ -174,6 +175,11 @@ def test_what_kernels_cannot_do_stays_with_torch(case, make_scene):
     ]
     assert tables[0].camera is None
     assert torch.equal(tables[0].means2d, tables[1].means2d)
+    if case == "lens":  # whose focal lengths and principal point are being fitted
+        (slope,) = torch.autograd.grad(tables[0].means2d.sum(dim=0) @ torch.tensor([1.0, 2.0]), K)
+        count = float(len(tables[0].index))
+        assert (slope[0, 2].item(), slope[1, 2].item()) == (count, 2 * count)
+        assert min(abs(slope[0, 0].item()), abs(slope[1, 1].item())) > 1e-3
 
 
 def test_a_pose_that_is_not_rigid_is_no_camera():

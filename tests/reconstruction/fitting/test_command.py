@@ -85,6 +85,18 @@ def test_the_contact_sheet_shows_truth_rendering_and_difference(boards, tmp_path
     assert difference.mean() > 150  # all of it is wrong, which is the bright end of the colours
 
 
+def test_narrow_rows_of_the_contact_sheet_end_in_white(monkeypatch, tmp_path):
+    from sgwarp.reconstruction.fitting import report
+
+    rows = [np.full((4, width, 3), width, np.uint8) for width in (10, 6, 8)]
+    monkeypatch.setattr(report, "_row", lambda gaussians, photograph, white: photograph)
+    report.write_contact_sheet(None, rows, tmp_path / "sheet.png")
+    expected = np.full((3 * (4 + 6), 10, 3), 255, np.uint8)
+    for k, row in enumerate(rows):
+        expected[10 * k : 10 * k + 4, : row.shape[1]] = row
+    np.testing.assert_array_equal(read_rgb(tmp_path / "sheet.png"), expected)
+
+
 def test_a_fit_starts_from_depth(boards, tmp_path):
     out = tmp_path / "scene.compressed.ply"
     depth = ["--depth", str(boards.folder / "depth"), "--hold-out", "0", "--cap", "900", "--steps", "5"]
