@@ -86,7 +86,7 @@ def test_palettes_of_sog_have_two_bytes(tmp_path, label):
     """Label = low byte + 256 high ones; each of 64 palettes a row is three pixels of degree 1."""
     centroids = np.zeros((16, 64 * 3, 4), np.uint8)
     centroids[..., 3] = 255
-    centroids[..., 0] = (np.arange(16 * 64 * 3).reshape(16, -1) // 3 % 64 + 64 * (np.arange(16)[:, None] % 4))
+    centroids[..., 0] = np.arange(16 * 64 * 3).reshape(16, -1) // 3 % 64 + 64 * (np.arange(16)[:, None] % 4)
     centroids[..., 1] = np.arange(16)[:, None]
     blank = np.full((1, 1, 4), 255, np.uint8)
     labels = np.array([[[label % 256, label // 256, 0, 255]]], np.uint8)
@@ -136,8 +136,8 @@ def test_points_without_colors_are_grey_and_said_to_be(tmp_path, caplog):
 @pytest.mark.parametrize("radius", [0.5, 30.0])
 def test_cameras_are_far_from_a_thousand_radii_on(radius):
     around = radius * np.array([[1.0, 0, 0], [-1, 0, 0], [0, 1, 0], [0, -1, 0]])
-    assert far_origin(around + [0, 0, 999 * radius]) is None
-    found = far_origin(around + [0, 0, 1001 * radius])
+    assert far_origin(around + np.array([0, 0, 999 * radius])) is None
+    found = far_origin(around + np.array([0, 0, 1001 * radius]))
     step = 10.0 if radius == 0.5 else 1000.0  # the power of ten from ten radii on
     np.testing.assert_array_equal(found, np.round(np.array([0, 0, 1001 * radius]) / step) * step)
 

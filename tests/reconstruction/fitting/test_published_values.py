@@ -123,7 +123,9 @@ def test_what_two_turns_of_seven_photographs_do_not_show_goes(strategy, cap, ski
     assert len(model) == (19 if gone and strategy == "default" else 20)
 
 
-@pytest.mark.parametrize(("scale", "extent", "left"), [(0.099, 1.0, 4), (0.101, 1.0, 3), (0.19, 2.0, 4), (0.21, 2.0, 3)])
+@pytest.mark.parametrize(
+    ("scale", "extent", "left"), [(0.099, 1.0, 4), (0.101, 1.0, 3), (0.19, 2.0, 4), (0.21, 2.0, 3)]
+)
 def test_what_is_larger_than_a_tenth_of_the_extent_goes_after_a_reset(scale, extent, left):
     model = cloud(4)
     model.groups["scales"].values[2] = scale
