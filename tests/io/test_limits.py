@@ -81,7 +81,7 @@ def test_positions_of_spz_have_the_bits_they_need(tmp_path, caplog, farthest, bi
     assert ("so positions are kept to" in caplog.text) == (bits < 12)
 
 
-@pytest.mark.parametrize("label", [0, 255, 256, 300, 1023])
+@pytest.mark.parametrize("label", [0, 255, 256, 300, 999, 1000, 1023])
 def test_palettes_of_sog_have_two_bytes(tmp_path, label):
     """Label = low byte + 256 high ones; each of 64 palettes a row is three pixels of degree 1."""
     centroids = np.zeros((16, 64 * 3, 4), np.uint8)
@@ -100,13 +100,17 @@ def test_palettes_of_sog_have_two_bytes(tmp_path, label):
         "scales": {"codebook": [-3.0] * 256, "files": ["s.webp"]},
         "quats": {"files": ["q.webp"]},
         "sh0": {"codebook": codebook, "files": ["d.webp"]},
-        "shN": {"count": 1024, "bands": 1, "codebook": codebook, "files": ["c.webp", "n.webp"]},
+        "shN": {"count": 1000, "bands": 1, "codebook": codebook, "files": ["c.webp", "n.webp"]},
     }
     with zipfile.ZipFile(tmp_path / "a.sog", "w") as archive:
         archive.writestr("meta.json", json.dumps(meta))
         for name, rgba in files.items():
             picture = cv2.imencode(".webp", rgba[..., [2, 1, 0, 3]].copy(), [cv2.IMWRITE_WEBP_QUALITY, 101])[1]
             archive.writestr(f"{name}.webp", picture.tobytes())
+    if label >= 1000:
+        with pytest.raises(InputError, match=f"a Gaussian has palette {label} of 1000; it is damaged"):
+            read_sog(tmp_path / "a.sog")
+        return
     sh = read_sog(tmp_path / "a.sog").sh[0]
     assert sh[1:, 0].tolist() == [label % 64 + 64 * (label // 64 % 4)] * 3
     assert sh[1:, 1].tolist() == [label // 64] * 3
