@@ -325,7 +325,10 @@ def _intrinsics(settings: GaussianRasterizationSettings) -> Tensor:
     P = torch.linalg.inv(view) @ full
     w = P[2, 3].item()
     off_axis = max(abs(P[i, j].item()) for i, j in ((0, 1), (1, 0), (0, 3), (1, 3)))
-    if not (w > 0 and off_axis < FOCAL_TOLERANCE * w):
+    # A shift that does not shrink with depth; as exact as float32 holds the product of both matrices.
+    shift = max(abs(P[3, j].item()) for j in (0, 1, 3))
+    centered = shift < FOCAL_TOLERANCE * (w + full[3].abs().max().item())
+    if not (w > 0 and off_axis < FOCAL_TOLERANCE * w and centered):
         raise InputError("projmatrix: expected viewmatrix times a perspective projection, both transposed")
     K = torch.eye(3, dtype=torch.float64, device="cpu")
     sizes = (settings.image_width, settings.image_height)
