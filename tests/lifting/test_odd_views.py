@@ -175,3 +175,18 @@ def test_what_is_marked_invalid_may_be_anything(stage, mode):
     )
     assert torch.equal(zero.features, nan.features)
     assert torch.equal(zero.weight, nan.weight)
+
+
+@pytest.mark.parametrize("kind", ["features", "labels"])
+def test_a_residual_is_that_of_the_means(stage, kind):
+    """Sums of a large weight have no more say in a pixel than those of a small one."""
+    view = stage.views[0]
+    found = stage.dense(view) if kind == "features" else stage.one_hot(view)
+    means = torch.rand(len(stage.gaussians), found.channels, generator=torch.Generator().manual_seed(0))
+    weight = torch.logspace(-3, 3, len(means))[torch.randperm(len(means), generator=torch.Generator().manual_seed(1))]
+    expected = residual(stage.gaussians, view.camera, found, means, torch.ones(len(means)))
+    got = residual(stage.gaussians, view.camera, found, means * weight[:, None], weight)
+    assert got == pytest.approx(expected, rel=1e-4)
+    assert residual(stage.gaussians, view.camera, found, means * weight[:, None], torch.ones(len(means))) != (
+        pytest.approx(expected, rel=1e-3)
+    )
