@@ -153,3 +153,40 @@ def test_images_for_a_source_that_looks_at_them(stage, stage_files):
     torch.testing.assert_close(source.seen[1], wanted, rtol=0, atol=1e-6)
     assert log.left_out["photographs_rendered_instead"] == 1
     assert {"read", "render", "encode"} <= set(log.stages)
+
+
+@pytest.mark.parametrize("mode", MODES)
+def test_what_is_marked_invalid_may_be_anything(stage, mode):
+    """NaN there changes no bit, in every walk over the views."""
+
+    def maps(filling):
+        found = {}
+        for view in stage.views[:3]:
+            whole = stage.dense(view)
+            valid = torch.arange(whole.size[1]).expand(whole.size) % 5 > 0
+            dense = torch.where(valid[..., None], whole.dense, filling)
+            found[view.stem] = FeatureMap(whole.space, dense=dense, valid=valid)
+        return found
+
+    settings = LiftSettings(ridge=10.0, passes=2, iterations=2, reliability=True)
+    zero, nan = (
+        lift(stage.gaussians, stage.views[:3], maps(filling), mode, lift_settings=settings)
+        for filling in (0.0, math.nan)
+    )
+    assert torch.equal(zero.features, nan.features)
+    assert torch.equal(zero.weight, nan.weight)
+
+
+@pytest.mark.parametrize("kind", ["features", "labels"])
+def test_a_residual_is_that_of_the_means(stage, kind):
+    """Sums of a large weight have no more say in a pixel than those of a small one."""
+    view = stage.views[0]
+    found = stage.dense(view) if kind == "features" else stage.one_hot(view)
+    means = torch.rand(len(stage.gaussians), found.channels, generator=torch.Generator().manual_seed(0))
+    weight = torch.logspace(-3, 3, len(means))[torch.randperm(len(means), generator=torch.Generator().manual_seed(1))]
+    expected = residual(stage.gaussians, view.camera, found, means, torch.ones(len(means)))
+    got = residual(stage.gaussians, view.camera, found, means * weight[:, None], weight)
+    assert got == pytest.approx(expected, rel=1e-4)
+    assert residual(stage.gaussians, view.camera, found, means * weight[:, None], torch.ones(len(means))) != (
+        pytest.approx(expected, rel=1e-3)
+    )

@@ -2,6 +2,7 @@
 
 import json
 import sys
+from dataclasses import asdict, replace
 
 import cv2
 import numpy as np
@@ -14,7 +15,7 @@ from sgwarp.evaluation.report import oracle
 from sgwarp.evaluation.report.extremes import Extreme
 from sgwarp.evaluation.report.page import Findings, Stability, write_json, write_page
 from sgwarp.evaluation.report.run import split_views
-from sgwarp.evaluation.report.stability import ImageResult
+from sgwarp.evaluation.report.stability import GradientResult, ImageResult
 from sgwarp.evaluation.report.sweep import Trial, pareto_front, rendering_variants
 from sgwarp.files.images import read_rgb
 from sgwarp.io.scenes import save_gaussians
@@ -223,6 +224,46 @@ def test_the_page_says_in_which_schedule_the_extremes_were_drawn(tmp_path, devic
     page = (tmp_path / "report.md").read_text()
     assert told in page
     assert ("in the schedule of GPUs on" in page) is (device != "CPU")
+
+
+def test_every_figure_of_an_extreme_scene_stands_in_its_column(tmp_path):
+    """The worse of both schedules on the page; each of them with its own bounds for machines."""
+    extreme = Extreme("flat", "one scale is 0", lambda: None, "as it is", image_bound=1e-4, gradient_bound=3e-3)
+    lanes = ImageResult(True, 1e-5, 0.25, 0.02, {"off_screen": 1200, "non_finite": 3}, 0.1)
+    block = ImageResult(True, 2e-5, 0.5, 0.07, {"off_screen": 1200, "non_finite": 3}, 0.2)
+    slopes = [GradientResult(True, {"means": 1e-3, "translation": value}) for value in (2e-3, 5e-4)]
+    stability = [
+        Stability(extreme, "lanes", 4321, lanes, slopes[0]),
+        Stability(extreme, "block", 4321, block, slopes[1]),
+    ]
+    rendering = [Trial("default", "", 0.004, 0.0001, {"max": 0.05, "mean": 0.002, "psnr": 41.25})]
+    findings = Findings(ABOUT, 3e-6, rendering, stability=stability)
+    write_page(findings, tmp_path / "report.md")
+    write_json(findings, tmp_path / "report.json")
+    page = (tmp_path / "report.md").read_text()
+    figures = [
+        "4,321",
+        "2.0e-05",
+        "1.0e-04",
+        "0.002",
+        "0.003",
+        "7%",
+        "1,200 off screen, 3 non finite",
+        "as it is",
+        "yes",
+    ]
+    assert row_of(page, "**flat**: one scale is 0") == ["**flat**: one scale is 0", *figures]
+    assert "1 of 1 extreme scenes" in page
+    record = json.loads((tmp_path / "report.json").read_text())["stability"]
+    for row, image, slope, schedule in zip(record, (lanes, block), slopes, ("lanes", "block"), strict=True):
+        assert row == {
+            **{"name": "flat", "what": "one scale is 0", "schedule": schedule, "gaussians": 4321, "within": True},
+            **{"image_bound": 1e-4, "gradient_bound": 3e-3, "image": asdict(image), "gradient": asdict(slope)},
+        }
+    faint = [Stability(extreme, "lanes", 4321, replace(lanes, error=2e-4), None)]
+    write_page(Findings(ABOUT, 3e-6, rendering, stability=faint), tmp_path / "report.md")
+    row = row_of((tmp_path / "report.md").read_text(), "**flat**: one scale is 0")
+    assert (row[2], row[4], row[-1]) == ("2.0e-04", "", "**no**")
 
 
 @pytest.mark.slow
