@@ -303,11 +303,11 @@ def build_gaussians(
             gaussians.non_finite,
             len(gaussians),
         )
-    _say_coarse(path, means[::SAMPLED].numpy(), scales[::SAMPLED].numpy())
+    say_coarse(path, means[::SAMPLED].numpy(), scales[::SAMPLED].numpy())
     return gaussians
 
 
-def _say_coarse(path: str | os.PathLike[str], means: NDArray[np.float32], scales: NDArray[np.float32]) -> None:
+def say_coarse(path: str | os.PathLike[str], means: NDArray[np.float32], scales: NDArray[np.float32]) -> None:
     """Log where coordinates are so large that float32 moves Gaussians by much of their size, as those of countries."""
     finite = np.isfinite(means).all(axis=1) & np.isfinite(scales).all(axis=1)
     if not finite.any():
