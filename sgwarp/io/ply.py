@@ -87,8 +87,8 @@ def _parse(path: str | os.PathLike[str], source: str | io.BytesIO) -> Elements:
         reason = " ".join(str(error).split()) or type(error).__name__
         if unknown := re.search(r"line (\d+): field type '(.*?)' not in", reason):
             raise InputError(
-                f"{path}: is not a valid PLY file (line {unknown[1]}: PLY has no type {unknown[2][:40]!r}); write these "
-                "numbers as float"
+                f"{path}: is not a valid PLY file (line {unknown[1]}: PLY has no type {unknown[2][:40]!r}); write "
+                "these numbers as float"
             ) from None
         raise InputError(f"{path}: is not a valid PLY file ({reason})") from None
     elements = {element.name: element.data for element in content.elements}
