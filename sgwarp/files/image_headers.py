@@ -33,6 +33,7 @@ LARGEST_RATIO = 1032  # of deflate
 JPEG_PIXELS_PER_BYTE = 512
 LARGEST_IMAGE = 2**27  # pixels, 8 bits of RGB in 400 MB
 VARIABLE = "SGWARP_LARGEST_IMAGE"
+TIFF_COLORS, LAB = 262, (8, 9, 10)  # CIELAB, ICC LAB and ITU LAB: libtiff takes their white for that of sRGB
 TIFF_WIDTH, TIFF_HEIGHT, TIFF_BITS, TIFF_SAMPLES, TIFF_TILE_WIDTH, TIFF_TILE_HEIGHT = 256, 257, 258, 277, 322, 323
 
 
@@ -63,6 +64,9 @@ def check_image(path: str | os.PathLike[str], data: bytes) -> tuple[int, int]:
         if kind:
             what = f"is {'an' if kind[0] in 'AO' else 'a'} {kind} image, which is not decoded"
         raise InputError(f"{path}: {what}; save it again as PNG or JPEG")
+    order = TIFF_SIGNATURES.get(data[:4])
+    if order and _tiff_tags(data, order).get(TIFF_COLORS) in LAB:
+        raise InputError(f"{path}: holds Lab colors, which decoders read differently; save it again as RGB")
     height, width = size
     limit = largest_image()
     if height * width > limit:
@@ -172,6 +176,16 @@ def _webp_size(data: bytes) -> tuple[int, int] | None:
 
 def _tiff_size(data: bytes, order: str) -> tuple[int, int] | None:
     """Of the first picture; a tile that is larger than the picture counts, for the decoder takes memory for it."""
+    tags = _tiff_tags(data, order)
+    height = max(tags.get(TIFF_HEIGHT, 0), tags.get(TIFF_TILE_HEIGHT, 0))
+    width = max(tags.get(TIFF_WIDTH, 0), tags.get(TIFF_TILE_WIDTH, 0))
+    if tags.get(TIFF_SAMPLES, 1) > 4:  # of an image with one to four channels no reader here wants more
+        return None
+    return (height, width) if height and width else None
+
+
+def _tiff_tags(data: bytes, order: str) -> dict[int, int]:
+    """Whole numbers of the first directory, by their tags; empty if it is cut short."""
     tags: dict[int, int] = {}
     try:
         (start,) = struct.unpack_from(f"{order}I", data, 4)
@@ -182,9 +196,5 @@ def _tiff_size(data: bytes, order: str) -> tuple[int, int] | None:
             if layout:
                 (tags[tag],) = struct.unpack_from(order + layout, data, start + 10 + 12 * number)
     except struct.error:
-        return None
-    height = max(tags.get(TIFF_HEIGHT, 0), tags.get(TIFF_TILE_HEIGHT, 0))
-    width = max(tags.get(TIFF_WIDTH, 0), tags.get(TIFF_TILE_WIDTH, 0))
-    if tags.get(TIFF_SAMPLES, 1) > 4:  # of an image with one to four channels no reader here wants more
-        return None
-    return (height, width) if height and width else None
+        return {}
+    return tags

@@ -87,8 +87,8 @@ def _parse(path: str | os.PathLike[str], source: str | io.BytesIO) -> Elements:
         reason = " ".join(str(error).split()) or type(error).__name__
         if unknown := re.search(r"line (\d+): field type '(.*?)' not in", reason):
             raise InputError(
-                f"{path}: line {unknown[1]} of its header has the type {unknown[2][:40]!r}, which PLY does not know; "
-                "write these numbers as float"
+                f"{path}: is not a valid PLY file (line {unknown[1]}: PLY has no type {unknown[2][:40]!r}); write "
+                "these numbers as float"
             ) from None
         raise InputError(f"{path}: is not a valid PLY file ({reason})") from None
     elements = {element.name: _loaded(path, element.data) for element in content.elements}
@@ -315,11 +315,11 @@ def build_gaussians(
             gaussians.non_finite,
             len(gaussians),
         )
-    _say_coarse(path, means[::SAMPLED].numpy(), scales[::SAMPLED].numpy())
+    say_coarse(path, means[::SAMPLED].numpy(), scales[::SAMPLED].numpy())
     return gaussians
 
 
-def _say_coarse(path: str | os.PathLike[str], means: NDArray[np.float32], scales: NDArray[np.float32]) -> None:
+def say_coarse(path: str | os.PathLike[str], means: NDArray[np.float32], scales: NDArray[np.float32]) -> None:
     """Log where coordinates are so large that float32 moves Gaussians by much of their size, as those of countries."""
     finite = np.isfinite(means).all(axis=1) & np.isfinite(scales).all(axis=1)
     if not finite.any():

@@ -15,7 +15,7 @@ from torch import Tensor
 from sgwarp.errors import InputError
 from sgwarp.io.archives import StackedArray, open_stacks
 from sgwarp.io.compressed_ply import gaussians_from_packed, is_compressed
-from sgwarp.io.ply import gaussians_from_elements, read_elements
+from sgwarp.io.ply import gaussians_from_elements, read_elements, say_coarse
 from sgwarp.scene import Gaussians
 
 SH_C0 = 0.28209479177387814  # of the constant harmonic
@@ -199,6 +199,8 @@ class ParamsSequence:
             sh = (rgb.astype(np.float64) - 0.5) / SH_C0
         fields = (means, quats, scales, opacities, sh[:, None])
         tensors = [torch.from_numpy(np.array(field, dtype=np.float32, order="C")) for field in fields]
+        if index == 0:  # of a sequence it is enough to say it once
+            say_coarse(self.path, tensors[0].numpy(), tensors[2].numpy())
         foreground = None
         if "seg_colors" in self._still:
             foreground = torch.from_numpy(self._still["seg_colors"][:, 0] > FOREGROUND_ABOVE)

@@ -50,5 +50,5 @@ def test_a_type_that_ply_does_not_have_is_named_in_short(tmp_path, values, kind)
     with pytest.raises(InputError) as caught:
         load_gaussians(path)
     assert str(caught.value) == (
-        f"{path}: line 4 of its header has the type '{kind}', which PLY does not know; write these numbers as float"
+        f"{path}: is not a valid PLY file (line 4: PLY has no type '{kind}'); write these numbers as float"
     )

@@ -140,6 +140,7 @@ def test_whole_paths_into_the_data_set_are_taken(tmp_path):
     [
         ("poses_bounds.npy", b"", "LLFF"),
         ("keyframes/cameras/1.json", b"{}", "Polycam.*ns-process-data polycam"),
+        ("rgbd/0.depth", b"", "Record3D.*ns-process-data record3d, of the .r3d file"),
         ("pose/0.txt", b"1 0 0 0", "ScanNet"),
         ("cams.xml", b"<?xml ?><document><chunk><cameras>", "Metashape"),
         ("cameras.json", b'[{"id": 0, "img_name": "a"}]', "3DGS trainer.*give the data set that it was trained on"),

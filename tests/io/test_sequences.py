@@ -64,6 +64,16 @@ def test_a_folder_with_params_and_double_precision(tmp_path):
     assert is_sequence(tmp_path)
 
 
+@pytest.mark.parametrize(("shift", "said"), [(0.0, 0), (5.4e6, 1)])
+def test_positions_that_float32_cannot_hold_are_said_once(tmp_path, caplog, shift, said):
+    means = published()["means3D"].astype(np.float64) + shift
+    np.savez(tmp_path / "params.npz", **published(means3D=means, log_scales=np.full((COUNT, 3), -2.0, np.float32)))
+    sequence = load_sequence(tmp_path / "params.npz")
+    for index in range(FRAMES):
+        sequence.frame(index)
+    assert caplog.text.count("lies so far from the origin") == said
+
+
 def test_scales_and_opacities_may_move(tmp_path):
     scales = np.random.default_rng(1).normal(size=(FRAMES, COUNT, 3)).astype(np.float32)
     np.savez(tmp_path / "params.npz", **published(log_scales=scales))

@@ -146,12 +146,23 @@ def _points_where_photographs_agree(
     """At most `count` pixels at their depth, and their colors."""
     images = (photograph.image().cpu().numpy() for photograph in photographs)
     maps = estimate_depth(images, [photograph.camera for photograph in photographs], 1.0, progress)
-    places = torch.from_numpy(np.concatenate([m.points[m.known.reshape(-1)] for m in maps]))
-    colors = torch.from_numpy(np.concatenate([m.colors[m.known] for m in maps]))
+    known = [m.known & _counted(photograph, m.known.shape) for m, photograph in zip(maps, photographs, strict=True)]
+    places = torch.from_numpy(np.concatenate([m.points[own.reshape(-1)] for m, own in zip(maps, known, strict=True)]))
+    colors = torch.from_numpy(np.concatenate([m.colors[own] for m, own in zip(maps, known, strict=True)]))
     share = sum(float(m.known.mean()) for m in maps) / len(maps)
     logger.info("start: the photographs agree on the depth of %.0f %% of their pixels", 100 * share)
     chosen = torch.randperm(len(places), generator=random)[:count].sort().values
     return places[chosen], colors[chosen]
+
+
+def _counted(photograph: Photograph, size: tuple[int, ...]) -> Any:
+    """Pixels of a small copy that a mask leaves whole, bool [h, w]: what is hidden may look even and seem to agree."""
+    import cv2
+
+    if photograph.mask is None:
+        return np.ones(size, bool)
+    mask = photograph.mask.cpu().numpy().astype(np.float32)
+    return cv2.resize(mask, size[::-1], interpolation=cv2.INTER_AREA) > 0.99
 
 
 def _points_anywhere(photographs: Sequence[Photograph], count: int, random: torch.Generator) -> tuple[Tensor, Tensor]:

@@ -34,3 +34,25 @@ def test_one_photograph_alone_tells_nothing(shots):
     camera, image, _ = shots[0]
     (found,) = estimate_depth([image], [camera], 1.0)
     assert not found.known.any()
+
+
+def test_depth_crosses_an_even_surface_from_its_border(shots):
+    """A square of 1 m on one wall, all of one color: no window inside tells its depth."""
+    images, inside = [], []
+    for camera, image, depth in shots:
+        x, y = np.meshgrid(np.arange(camera.width) + 0.5, np.arange(camera.height) + 0.5)
+        rays = np.stack([x, y, np.ones_like(x)], axis=-1) @ np.linalg.inv(camera.K.numpy()).T
+        at = camera.position.numpy() + depth[..., None] * (rays @ camera.world_to_camera[:3, :3].numpy())
+        square = (np.abs(at[..., 0] - 0.8) < 0.5) & (np.abs(at[..., 1]) < 0.5)
+        images.append(np.where(square[..., None], np.float32(0.5), image))
+        inside.append(square)
+    errors, known = [], []
+    maps = estimate_depth(images, [camera for camera, _, _ in shots], 1.4)
+    for found, square, (_, _, depth) in zip(maps, inside, shots, strict=True):
+        sizes = zip(depth.shape, found.depth.shape, strict=True)
+        rows, columns = (np.linspace(0, large - 1, small).round().astype(int) for large, small in sizes)
+        own = square[np.ix_(rows, columns)]
+        errors.append(np.abs(found.depth / depth[np.ix_(rows, columns)] - 1)[own & found.known])
+        known.append(found.known[own])
+    assert np.concatenate(known).mean() > 0.8
+    assert np.median(np.concatenate(errors)) < 0.015
