@@ -106,10 +106,13 @@ NEEDS: dict[str, dict[str, Need]] = {
         "transform": VIEWS,
         "images": VIEWS,
         "views": Need("--view, click: or --script", _looks),
-        **dict.fromkeys(("negatives", "threshold"), Need("texts, which need --semantics", _has("semantics"))),
+        **dict.fromkeys(
+            ("negatives", "threshold"),
+            Need("texts, which need --semantics", lambda one: one.semantics is not None or one.script is not None),
+        ),
     },
     "render": {
-        **dict.fromkeys(("transform", "view", "images"), VIEWS),
+        **dict.fromkeys(("transform", "images"), VIEWS),
         **dict.fromkeys(("frames", "size", "up"), Need("a turn around the scene, without --views", _is("views", None))),
         "background": Need("--mode rgb", _is("mode", "rgb")),
     },
@@ -189,7 +192,7 @@ ALWAYS: dict[str, set[str]] = {
     | {"out", "select", "keep", "grow", "clean", "semantics", "instances", "encoder", "remove", "extract", "isolate"}
     | {"duplicate", "scale", "rotate", "move", "recolor", "plain", "script", "undo", "view"},
     "view": SCENE | {"semantics", "instances", "predicted", "views", "host", "port"},
-    "render": SCENE | {"out", "views", "mode"},
+    "render": SCENE | {"out", "views", "view", "mode"},
     "batch": {"scenes", "do", "out", "options", "engine", "address", "shard", "workers", "threads", "device", "gpus"}
     | {"retry_failed", "time_limit", "memory_limit", "command_line"},
     "info": COMMON | {"scene", "data_set", "json"},

@@ -20,8 +20,10 @@ if TYPE_CHECKING:
     from sgwarp.viewer.live import Live
     from sgwarp.viewer.workbench import Workbench
 
-OF_VIEWS: tuple[str, ...] = ("transform", "cache", "cache_limit", "mode", "tau", "border", "passes", "ridge")
-OF_VIEWS += ("iterations", "reliability", "fill", "share_of_views", "photographs", "deterministic", "images", "view")
+OF_VIEWS = (
+    *("transform", "cache", "cache_limit", "mode", "tau", "border", "passes", "ridge", "iterations"),
+    *("reliability", "fill", "share_of_views", "photographs", "deterministic", "images", "view"),
+)
 
 
 @dataclass(kw_only=True)

@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 from sgwarp.errors import InputError
 from sgwarp.files.documents import read_json
 from sgwarp.io.colmap import find_model
+from sgwarp.io.names import inside
 from sgwarp.io.stems import IMAGE_SUFFIXES
 from sgwarp.io.views import TRANSFORMS, load_views, note_files
 from sgwarp.io.world_transforms import moved_views
@@ -180,10 +181,12 @@ class MetaViews:
             if stem in seen:
                 raise InputError(f"{where}: is another view named '{stem}'; give every camera its own cam_id")
             seen.add(stem)
-            image = self._images / file if file and self._photographs else None
+            named = inside(self.path, self._images, file) if file else None
+            image = named if self._photographs else None
             there = image is not None and os.path.isfile(image)
             view = View(stem, self._camera(where, lens, pose), image if there else None)
             found.append(FrameView(view, file, image is not None and not there and self._images.is_dir()))
+        note_files(one.view for one in found)
         return self._with_near_planes(found)
 
     def _with_near_planes(self, found: list[FrameView]) -> list[FrameView]:

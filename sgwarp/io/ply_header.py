@@ -51,7 +51,7 @@ def check_ply(path: str | os.PathLike[str]) -> None:
     rest = size - end
     for element in elements:
         if element.count < 0:  # without properties NumPy would divide by 0, which ends the process (SIGFPE)
-            raise InputError(f"{path}: its element '{element.name}' has {element.count} rows; the file is damaged")
+            raise InputError(f"{path}: is not a valid PLY file (its element '{element.name}' has {element.count} rows)")
         # In ascii a number takes a digit and a separator, the last one of the file only a digit.
         row = 2 * len(element.sizes) if text else sum(element.sizes)
         if element.count * row > rest + text:

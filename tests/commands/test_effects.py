@@ -52,7 +52,7 @@ MET = {
         "views": "--view 1",
         **dict.fromkeys(("negatives", "threshold"), "--semantics s"),
     },
-    "render": dict.fromkeys(("transform", "view", "images"), "--views v"),
+    "render": dict.fromkeys(("transform", "images"), "--views v"),
     "track": {
         **{"split": "--views moving", "mask_split": "--mask-views moving"},
         **dict.fromkeys(("scoring", "temperature"), "--classes a"),

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 from sgwarp.errors import InputError
+from sgwarp.io.moving_views import load_moving_views
 from sgwarp.io.names import inside
 from sgwarp.io.points import load_points
 from sgwarp.io.views import load_views
@@ -73,3 +74,18 @@ def test_sizes_that_no_kernel_counts(tmp_path, size):
     (tmp_path / "images.txt").write_text("1 1 0 0 0 0 0 1 1 a.png\n\n")
     with pytest.raises(InputError, match=r"camera 1: image size: .* is more than 2147483647 pixels"):
         load_views(tmp_path, photographs=False)
+
+
+@pytest.mark.parametrize("name", ["../secret.png", "/etc/secret.png", "0/../../secret.png"])
+def test_a_photograph_of_a_moving_scene_outside(tmp_path, monkeypatch, name):
+    """Whether the photographs are read or not: label images are looked for under the same name."""
+    pose = np.eye(4).tolist()
+    meta = {"w": 16, "h": 12, "k": [[np.diag([20.0, 20.0, 1.0]).tolist()]], "w2c": [[pose]], "fn": [[name]]}
+    (tmp_path / "ims").mkdir()
+    (tmp_path / "train_meta.json").write_text(json.dumps(meta | {"cam_id": [[0]]}))
+    cv2.imwrite(str(tmp_path / "secret.png"), np.zeros((12, 16, 3), np.uint8))
+    for photographs in (True, False):
+        with pytest.raises(InputError, match="lies outside the data set"):
+            load_moving_views(tmp_path, photographs=photographs).at(0)
+    monkeypatch.setenv("SGWARP_OUTSIDE", "1")
+    assert load_moving_views(tmp_path).at(0)[0].file == name

@@ -99,8 +99,7 @@ def write_video(path: Path, pictures: Sequence[Path]) -> None:
         writer = cv2.VideoWriter(str(temporary), cv2.VideoWriter.fourcc(*"mp4v"), FRAMES_PER_SECOND, (width, height))
         if not writer.isOpened():
             raise InputError(
-                f"{path}: cannot be written: the disk is full, or this OpenCV has no MPEG-4 encoder "
-                "(--no-pictures leaves it out)"
+                f"{path}: cannot be written: the disk is full, or this OpenCV has no MPEG-4 encoder; see --no-pictures"
             )
         for picture in pictures:
             board = np.full((height, width, 3), 255, np.uint8)
