@@ -271,6 +271,7 @@ def test_cameras_that_cannot_be_meant_are_named(tmp_path, meta, own, message):
         (np.diag([1.01, 1, 1, 1]).tolist(), "must be orthogonal unit vectors"),
         (np.diag([-1.0, 1, 1, 1]).tolist(), "mirrors the world"),
         (np.diag([1.0, 1, 1, 2]).tolist(), "the last row of 'transform_matrix'"),
+        (np.diag([1.0, 1, 1, 1.001]).tolist(), "the last row of 'transform_matrix'"),
     ],
 )
 def test_poses_that_cannot_be_meant_are_said_and_cost_their_frame(tmp_path, caplog, matrix, message):
