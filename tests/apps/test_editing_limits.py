@@ -158,7 +158,7 @@ REFUSED = (
 
 @pytest.mark.parametrize("content", TAKEN)
 def test_values_that_are_taken(content):
-    step_from({"select": ["all"]} | content)
+    assert step_from({"select": ["all"]} | content).operation.name == content["do"]
 
 
 @pytest.mark.parametrize(("content", "message"), REFUSED)

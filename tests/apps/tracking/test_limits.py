@@ -159,7 +159,8 @@ def test_settings_of_fusion_that_are_refused(given, message):
 
 def test_settings_of_fusion_that_are_taken():
     for given in ({"forgetting": 0.0}, {"forgetting": 1.0}, {"patience": 1}, {"change": 2.0}, {"change": 1e-6}):
-        FusionSettings(**given)
+        settings = FusionSettings(**given)
+        assert {name: getattr(settings, name) for name in given} == given
 
 
 @pytest.mark.parametrize(("change", "contradicts"), [(0.1, False), (0.09, True), (None, True)])

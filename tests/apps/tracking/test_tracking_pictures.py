@@ -61,8 +61,9 @@ def test_a_video_shows_the_pictures_one_after_the_other(drawn, tmp_path, monkeyp
 
     Writer.fourcc = staticmethod(cv2.VideoWriter.fourcc)
     monkeypatch.setattr(cv2, "VideoWriter", Writer)
+    monkeypatch.setattr(pictures, "require_frames", lambda where, path, count: made.append(count))
     pictures.write_video(tmp_path / "v.mp4", drawn)
-    assert made == [(Writer.fourcc(*"mp4v"), 10, (24, 16)), "released"]
+    assert made == [(Writer.fourcc(*"mp4v"), 10, (24, 16)), "released", len(drawn)]
     assert (tmp_path / "v.mp4").is_file()
     for frame, path in zip(frames, drawn, strict=True):
         one = read_rgb(path)

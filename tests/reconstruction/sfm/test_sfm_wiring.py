@@ -75,7 +75,7 @@ def test_options_of_features(library, tmp_path, width, height, faint, one_camera
     assert reader.camera_model == "OPENCV"
     assert vars(reader).get("existing_camera_id") == camera
     assert (extraction.max_image_size, extraction.num_threads, extraction.use_gpu) == (1600, 3, False)
-    assert vars(extraction.sift).get("peak_threshold") == (0.003 if faint else None)
+    assert vars(extraction.sift).get("peak_threshold") == (0.0015 if faint else None)
 
 
 def test_photographs_of_one_size_go_together(library, monkeypatch, tmp_path):
