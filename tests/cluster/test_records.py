@@ -6,8 +6,8 @@ import signal
 import pytest
 
 from sgwarp.cluster import records
-from sgwarp.cluster.records import STAGES, Place
-from sgwarp.cluster.tasks import Limits
+from sgwarp.cluster.records import FAILED, STAGES, Place, read_json
+from sgwarp.cluster.tasks import Limits, Task
 from sgwarp.cluster.watching import watched
 from sgwarp.cluster.working import work
 from sgwarp.errors import InputError
@@ -41,3 +41,11 @@ def test_what_a_killed_process_left_without_a_record_is_removed(batch, record):
     assert work(task).status == "done"
     assert not (place.final / "old.bin").exists()
     assert list(json.loads((place.final / "done.json").read_text())["seconds"]) == ["first", "second"]
+
+
+def test_an_endless_error_is_recorded_in_part(tmp_path):
+    """A library may print a whole array into its message; a table of scenes has a line for each."""
+    outcome = work(Task("a", str(tmp_path), (), (), "none:none", "1", fault="no room: " + "x" * 5000))
+    assert outcome.status == "failed"
+    assert outcome.error == "no room: " + "x" * 991
+    assert read_json(Place(tmp_path, "a").final / FAILED)["error"] == outcome.error

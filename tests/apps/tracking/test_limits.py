@@ -347,3 +347,11 @@ def test_facts_compare_gaussians_of_one_identity():
     assert (facts["median_step"], facts["largest_step"]) == (2.0, 2.0)
     assert facts["foreground_share"] == pytest.approx(2 / 3)
     assert facts["non_finite_rows"] == 0
+
+
+def test_objects_without_identity_are_numbered_from_one(stage):
+    """0 is unknown in every label image that is written."""
+    source = Associated(None)
+    (view, *_) = stage.views
+    source._ready, source.count = {view.stem: torch.zeros(view.camera.size, dtype=torch.int64)}, 3
+    assert source.encode(0, FrameView(view), None).labels == ("1", "2", "3")
