@@ -293,13 +293,13 @@ class Tab:
     def edit(self, operation: Operation) -> str:
         """Apply an operation to the selection, for all tabs; says what was done. What is left of it stays selected."""
         self.bench.require_still(operation)
-        with self._lock:
-            found = self.found
-            if found is None:
-                raise InputError(NOTHING)
-            self.bench.apply(self.bench.term_of(found.selected, found.instance), operation)
-            if self.found is None:
-                self.clear_selection()  # so that an undo shows the scene as it was
+        found = self.found
+        if found is None:
+            raise InputError(NOTHING)
+        # Without our lock: every tab hears of the edit, and another one may be in the middle of its own.
+        self.bench.apply_to(found.selected, found.instance, operation)
+        if self.found is None:
+            self.clear_selection()  # so that an undo shows the scene as it was
         return f"{operation.name}: {int(found.selected.sum()):,} Gaussians; {len(self.bench.state.gaussians):,} in all"
 
     # The picture

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import threading
 from collections import OrderedDict
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
 from typing import Any
 
@@ -108,9 +109,16 @@ class Workbench:
             self._listeners.append(listener)
         return lambda: self._listeners.remove(listener) if listener in self._listeners else None
 
-    def _changed(self) -> None:
-        self._revision += 1
-        listeners = list(self._listeners)
+    @contextmanager
+    def _changing(self) -> Iterator[None]:
+        """Change the scene in the block, then tell the listeners.
+
+        They are told after the lock is given back: a listener takes the lock of its tab, which may wait for ours.
+        """
+        with self._lock:
+            yield
+            self._revision += 1
+            listeners = list(self._listeners)
         for listener in listeners:
             listener()
 
@@ -172,11 +180,21 @@ class Workbench:
             InputError: The scene moves, or as `EditSession.apply`; nothing has changed then.
         """
         self.require_still(operation)
-        with self._lock:
+        with self._changing():
             before = len(self.session.state.gaussians)
             after = self.session.apply(EditStep(Selection((term,), clean=False), operation))
-            self._changed()
         return f"{operation.name}: {before} Gaussians before, {len(after.gaussians)} after"
+
+    def apply_to(self, chosen: Tensor, instance: int, operation: Operation) -> None:
+        """Edit what is chosen, as `term_of` takes it, in one step: no other edit comes between.
+
+        Raises:
+            InputError: As `term_of` and `apply`; nothing has changed then.
+        """
+        self.require_still(operation)
+        with self._changing():
+            term = self.term_of(chosen, instance)
+            self.session.apply(EditStep(Selection((term,), clean=False), operation))
 
     def undo(self) -> str:
         """Go back by one edit; says which.
@@ -184,10 +202,10 @@ class Workbench:
         Raises:
             InputError: There is none.
         """
-        with self._lock:
+        with self._changing():
             self.session.undo()
-            self._changed()
-            return f"undone: {self.session.undone[0].operation.name}"
+            name = self.session.undone[0].operation.name
+        return f"undone: {name}"
 
     def redo(self) -> str:
         """Apply again what was undone last; says what.
@@ -195,10 +213,10 @@ class Workbench:
         Raises:
             InputError: There is nothing.
         """
-        with self._lock:
+        with self._changing():
             self.session.redo()
-            self._changed()
-            return f"done again: {self.session.steps[-1].operation.name}"
+            name = self.session.steps[-1].operation.name
+        return f"done again: {name}"
 
     def term_of(self, chosen: Tensor, instance: int = 0) -> str:
         """The shortest term that selects exactly these Gaussians of the scene as it is now.
@@ -223,18 +241,16 @@ class Workbench:
 
     def replace_scene(self, gaussians: Gaussians) -> None:
         """Show another state of a scene that grows, such as that of a fit; edits of the old one are gone."""
-        with self._lock:
+        with self._changing():
             self.materials = replace(self.materials, gaussians=gaussians, instances=None, semantics=None)
             self._begin(self.materials)
-            self._changed()
 
     def replace_semantics(self, semantics: Semantics) -> None:
         """Take what is known so far from a lift that goes on."""
-        with self._lock:
+        with self._changing():
             self.materials = replace(self.materials, semantics=semantics)
             self.session.context = replace(self.session.context, semantics=semantics)
             self.asker = replace(self.asker, semantics=semantics)
-            self._changed()
 
     def extent(self) -> tuple[tuple[float, float, float], tuple[float, float, float]]:
         """Two corners of a box that holds all centers but the outermost hundredth on each side [scene units]."""
