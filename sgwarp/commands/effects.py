@@ -16,6 +16,7 @@ from typing import Any, NamedTuple
 
 logger = logging.getLogger("sgwarp")
 LABELS = "the semantics were lifted from label images, whose names are asked as they are"
+IDS = "the maps hold ids, which are not asked in words"
 
 
 class Need(NamedTuple):
@@ -39,10 +40,6 @@ def _moving_cameras(folder: str, split: str) -> Callable[[Any], bool]:
         return path is not None and (path / f"{getattr(command, split)}_meta.json").is_file()
 
     return met
-
-
-def _asks_classes(command: Any) -> bool:
-    return command.classes is not None and not command.encoder.startswith("files:")
 
 
 def _lifts(command: Any) -> bool:
@@ -121,9 +118,7 @@ NEEDS: dict[str, dict[str, Need]] = {
         "mask_split": Need(
             "--mask-views with {split}_meta.json of Dynamic3DGaussians", _moving_cameras("mask_views", "mask_split")
         ),
-        **dict.fromkeys(
-            ("scoring", "temperature"), Need("--classes and an encoder that is asked in words", _asks_classes)
-        ),
+        **dict.fromkeys(("scoring", "temperature"), Need("--classes", _has("classes"))),
         "foreground": Need("params.npz of Dynamic3DGaussians", lambda command: command.scene.suffix == ".npz"),
         "cache_limit": CACHE,
     },

@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Any, Literal
 
 import tyro
 
+from sgwarp.commands.effects import IDS, say_unused
 from sgwarp.commands.inputs_kept import LOG
 from sgwarp.commands.options import Options, check_folder
 from sgwarp.commands.segment import class_names
@@ -179,6 +180,8 @@ class Track(Options):
         classes = None if self.classes is None else tuple(class_names(self.classes))
         texts = () if self.text is None else tuple(class_names(self.text, "--text"))
         encoder = encoder_of_questions(self.encoder, source.of_space, self.device) if classes or texts else None
+        if classes and encoder is None:
+            say_unused(self, ("scoring", "temperature"), IDS)
         questions = Questions(classes, texts, encoder, self.scoring, self.temperature, self.unknown_below)
         return Tracker(source, settings, log), questions
 

@@ -1,4 +1,4 @@
-"""safetensors files: read with the library's checks, written so that the same tensors give the same bytes.
+"""safetensors files: read without mapping them, written so that the same tensors give the same bytes.
 
 The library itself maps files, and its writer puts the metadata in an order that changes from run to run.
 Source of the layout: huggingface/safetensors, README, read for the format only.

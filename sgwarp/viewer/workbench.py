@@ -179,10 +179,9 @@ class Workbench:
         Raises:
             InputError: The scene moves, or as `EditSession.apply`; nothing has changed then.
         """
-        self.require_still(operation)
         with self._changing():
             before = len(self.session.state.gaussians)
-            after = self.session.apply(EditStep(Selection((term,), clean=False), operation))
+            after = self._edit(term, operation)
         return f"{operation.name}: {before} Gaussians before, {len(after.gaussians)} after"
 
     def apply_to(self, chosen: Tensor, instance: int, operation: Operation) -> None:
@@ -191,10 +190,12 @@ class Workbench:
         Raises:
             InputError: As `term_of` and `apply`; nothing has changed then.
         """
-        self.require_still(operation)
         with self._changing():
-            term = self.term_of(chosen, instance)
-            self.session.apply(EditStep(Selection((term,), clean=False), operation))
+            self._edit(self.term_of(chosen, instance), operation)
+
+    def _edit(self, term: str, operation: Operation) -> EditState:
+        self.require_still(operation)
+        return self.session.apply(EditStep(Selection((term,), clean=False), operation))
 
     def undo(self) -> str:
         """Go back by one edit; says which.

@@ -382,18 +382,22 @@ def test_the_encoder_is_made_with_cache_and_device(stopped, monkeypatch, tmp_pat
     assert asked.pop()[3] is None
 
 
-def test_features_from_files_are_asked_in_words(stopped, files, monkeypatch, tmp_path):
+def test_features_from_files_are_asked_in_words(stopped, files, monkeypatch, tmp_path, caplog):
     """Ids are not; so what the files hold decides, not how the source is called."""
     asked = []
     speak = "sgwarp.encoders.registry.text_encoder_for"
     monkeypatch.setattr(speak, lambda space, device: asked.append((space, device)) or "words")
     assert stopped("--classes", "a,b").questions.encoder is None
+    stopped("--classes", "a,b", "--temperature", "0.5")
+    assert caplog.messages == ["--temperature has no effect: the maps hold ids, which are not asked in words"]
+    caplog.clear()
     (tmp_path / "maps" / "00000").mkdir(parents=True)
     for stem in ("0", "1", "2"):
         np.save(tmp_path / "maps" / "00000" / f"{stem}.npy", np.ones((12, 16, 2), np.float32))
     (tmp_path / "maps" / "00000" / "space.json").write_text('{"space": "mine"}')
-    call = stopped("--encoder", f"files:{tmp_path / 'maps'}", "--classes", "a,b")
+    call = stopped("--encoder", f"files:{tmp_path / 'maps'}", "--classes", "a,b", "--temperature", "0.5")
     assert (call.questions.encoder, asked) == ("words", [("mine", "cpu")])
+    assert not any("--temperature" in message for message in caplog.messages)
 
 
 # Extremes, as files
