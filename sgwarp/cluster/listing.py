@@ -9,6 +9,7 @@ import shlex
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import Any
 
 from sgwarp.errors import InputError
 from sgwarp.files.access import read_bytes
@@ -106,7 +107,7 @@ def _same_place(path: Path, out: Path | None) -> bool:
 def _csv_rows(path: Path) -> Iterator[tuple[str, Path, dict[str, str]]]:
     lines = ["" if line.startswith("#") else line for line in _read(path).splitlines()]
     before = next((number for number, line in enumerate(lines) if line), 0)  # lines before the names of the columns
-    rows = csv.DictReader(lines[before:])
+    rows = csv.reader(lines[before:])
     try:
         yield from _scenes_of(path, rows, before)
     except csv.Error as error:  # of a cell without end, for one
@@ -114,21 +115,24 @@ def _csv_rows(path: Path) -> Iterator[tuple[str, Path, dict[str, str]]]:
         raise InputError(f"{path}: line {line} cannot be read ({error}); quote cells in pairs") from None
 
 
-def _scenes_of(path: Path, rows: csv.DictReader[str], before: int) -> Iterator[tuple[str, Path, dict[str, str]]]:
-    heads = [head.strip() for head in rows.fieldnames or ()]
+def _scenes_of(path: Path, rows: Any, before: int) -> Iterator[tuple[str, Path, dict[str, str]]]:
+    heads = [head.strip() for head in next(rows, ())]
     if "path" not in heads:
         raise InputError(f"{path}: has no column 'path'; its first line names the columns: path,name,fit.steps,...")
     if twice := next((head for head in heads if head and heads.count(head) > 1), None):
         raise InputError(f"{path}: column '{twice}' stands there twice; leave one")
     for row in rows:
-        if None in row:
-            line = before + rows.line_num
+        line = before + rows.line_num
+        if len(row) > len(heads):
             raise InputError(f"{path}: line {line} has more cells than there are columns; quote commas")
-        cells = {head: (value or "").strip() for head, value in zip(heads, row.values(), strict=True)}
+        values = [value.strip() for value in row] + [""] * (len(heads) - len(row))
+        if any(value for head, value in zip(heads, values, strict=True) if not head):
+            raise InputError(f"{path}: line {line} has a cell in a column without a name; name it in the first line")
+        cells = {head: value for head, value in zip(heads, values, strict=True) if head}
         if not any(cells.values()):
             continue
         if not cells["path"]:
-            raise InputError(f"{path}: line {before + rows.line_num} has no path")
+            raise InputError(f"{path}: line {line} has no path")
         place = path.parent / cells.pop("path")
         yield cells.pop("name", "") or _name(place), place, {key: value for key, value in cells.items() if value}
 

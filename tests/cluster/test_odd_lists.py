@@ -34,12 +34,23 @@ def test_a_text_file_of_windows(tmp_path):
         ("path,fit.steps,fit.steps\na,1,2\n", "column 'fit.steps' stands there twice"),
         ("", "no column 'path'"),
         ("# scans\npath,name\na,x\n,y\n", "line 4 has no path"),
+        ("path,\na,5\n", "line 2 has a cell in a column without a name"),
+        ("path,,fit.steps,\na,,7,\nb,,7,x\n", "line 3 has a cell in a column without a name"),
     ],
 )
 def test_bad_tables_are_refused(tmp_path, text, match):
     (tmp_path / "list.csv").write_text(text)
     with pytest.raises(InputError, match=match):
         list_scenes(str(tmp_path / "list.csv"))
+
+
+def test_commas_at_the_end_name_no_columns(tmp_path):
+    """A spreadsheet writes them where it once had more columns."""
+    (tmp_path / "list.csv").write_text("path,fit.steps,,\na,7,,\n,,,\nb\n")
+    assert [(scene.name, scene.options) for scene in list_scenes(str(tmp_path / "list.csv"))] == [
+        ("a", {"fit.steps": "7"}),
+        ("b", {}),
+    ]
 
 
 def test_a_name_too_long_for_a_folder_is_refused(tmp_path):
