@@ -1,6 +1,6 @@
 """What a fit starts from, and what that is worth: the room with points, without, and without poses.
 
-    SGWARP_DATA=FOLDER python -m benchmarks.starts [START ...] [--steps 1500] [--cap 30000] [--downscale 2]
+    SGWARP_DATA=FOLDER python -m benchmarks.starts [START ...] [--steps 1500] [--cap 30000] [--downscale 2] [--repeats 1]
 
 Each start is fitted and added to benchmarks/starts.json: PSNR of the held-out views, the gap to the fitted ones, mIoU
 of true labels lifted into the scene, and seconds. `photographs` finds the poses as well, those of held-out views too,
@@ -90,12 +90,19 @@ def measure(start: str, folder: Path, settings: FitSettings, downscale: int) -> 
     return row
 
 
+def mean_of(rows: list[dict[str, float]]) -> dict[str, Any]:
+    """Means of the figures, and each PSNR where there are several: structure from motion is not the same twice."""
+    means: dict[str, Any] = {name: float(np.mean([row[name] for row in rows])) for name in rows[0]}
+    return means | ({"PSNR_of_each": [row["PSNR"] for row in rows]} if len(rows) > 1 else {})
+
+
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("starts", nargs="*", choices=[*STARTS, []], default=STARTS)
     parser.add_argument("--steps", type=int, default=1500)
     parser.add_argument("--cap", type=int, default=30_000)
     parser.add_argument("--downscale", type=int, default=2)
+    parser.add_argument("--repeats", type=int, default=1)
     parser.add_argument("--out", type=Path, default=Path(__file__).with_name("starts.json"))
     options = parser.parse_args()
     data = os.environ.get("SGWARP_DATA")
@@ -106,7 +113,7 @@ def main() -> None:
         steps=steps, cap=options.cap, evaluate_every=max(1, steps // EVALUATIONS), degree_every=max(1, steps // 4)
     )
     for start in options.starts:
-        row = measure(start, Path(data) / "room", settings, options.downscale)
+        row = mean_of([measure(start, Path(data) / "room", settings, options.downscale) for _ in range(options.repeats)])
         results = json.loads(options.out.read_text()) if options.out.is_file() else {}
         results[start] = row | {"steps": steps, "cap": options.cap, "downscale": options.downscale}
         with atomic_path(options.out) as temporary:

@@ -76,6 +76,11 @@ def pytest_addoption(parser: pytest.Parser) -> None:
     parser.addoption("--record-slow", action="store_true", help="add tests that take long to tests/slow_tests.txt")
 
 
+def pytest_make_parametrize_id(config: pytest.Config, val: object, argname: str) -> str | None:
+    """Bytes do not name a test: packed ones may hold the time, and workers that collect other names run nothing."""
+    return argname if isinstance(val, bytes) else None
+
+
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
     _slow_tests.mark(items)
 
