@@ -124,7 +124,8 @@ def estimate_poses(
         progress: Called as `progress(done, total, text)`.
 
     Raises:
-        InputError: pycolmap is not installed, there are fewer than 3 photographs, or they do not overlap enough.
+        InputError: pycolmap is not installed, there are fewer than 3 photographs, they do not overlap enough, or `out`
+            holds a model, a database or photographs that this program did not put there.
     """
     pycolmap = require_pycolmap()
     settings, report = settings or SfmSettings(), progress or (lambda done, total, text: None)
@@ -133,9 +134,11 @@ def estimate_poses(
     if unread := describe_unread(folder):
         logger.warning("%s: %s", folder, unread)
     _keep_photographs(folder, names, out)
+    known = _read_notes(out)
+    if not known:
+        _keep_others(folder, out)
     out.mkdir(parents=True, exist_ok=True)
     own = _fingerprint(folder, names, settings)
-    known = _read_notes(out)
     if known.get("fingerprint") == own and (out / MODEL / "images.bin").is_file():
         logger.info("%s: holds the poses of these photographs already", out)
         return Registration(tuple(known["registered"]), known["left_out"], known["points"], known["error"])
@@ -178,6 +181,20 @@ def _keep_photographs(folder: Path, names: Sequence[str], out: Path) -> None:
         path = (folder / name).resolve()
         if any(path.is_relative_to(place) for place in removed):
             raise InputError(f"{folder / name}: would be removed by the results, which go there; choose another --out")
+
+
+def _keep_others(folder: Path, out: Path) -> None:
+    """Refuse a folder in which another program's results would be replaced: COLMAP names its own the same.
+
+    Raises:
+        InputError: There are such results.
+    """
+    images = out / "images"
+    found = [path for path in (out / "database.db", out / MODEL) if os.path.lexists(path)]
+    if os.path.lexists(images) and images.resolve() != folder.resolve():
+        found.append(images)
+    if found:
+        raise InputError(f"{found[0]}: is there already, and `sgwarp poses` did not make it; choose another --out")
 
 
 def _why_unreadable(path: Path) -> str | None:

@@ -2,13 +2,18 @@
 
 from __future__ import annotations
 
+import json
 import os
 import shutil
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
 from sgwarp.errors import InputError
+from sgwarp.files.access import reading
+from sgwarp.files.documents import read_json
+from sgwarp.files.inputs import own_files
 from sgwarp.runs.progress import Report
 
 VIDEO_SUFFIXES = (".mp4", ".mov", ".m4v", ".avi", ".mkv", ".webm")
@@ -16,6 +21,7 @@ WANTED = 150  # photographs of a video, unless the interval is given
 SHORTEST = 3  # frames of which one is kept
 SMALL = 480  # width at which sharpness is judged [pixels]
 QUALITY = 95  # of the JPEGs
+NOTES = "frames.json"  # beside the frames: what they were taken from
 
 
 def is_video(path: Path) -> bool:
@@ -24,9 +30,10 @@ def is_video(path: Path) -> bool:
 
 
 def extract_frames(video: Path, folder: Path, every: int | None = None, progress: Report | None = None) -> int:
-    """Write the sharpest of every `every` frames as {number}.jpg; an existing folder is kept as it is.
+    """Write the sharpest of every `every` frames as {number}.jpg.
 
-    Sharpness is the variance of the Laplacian of a small gray copy.
+    A folder of frames of the same video and interval is kept as it is; frames of another are replaced. Sharpness
+    is the variance of the Laplacian of a small gray copy.
 
     Args:
         video: What OpenCV can decode.
@@ -38,14 +45,20 @@ def extract_frames(video: Path, folder: Path, every: int | None = None, progress
         How many photographs the folder holds.
 
     Raises:
-        InputError: OpenCV cannot decode the video, or it holds fewer than 3 frames to keep.
+        InputError: OpenCV cannot decode the video, it holds fewer than 3 frames to keep, or the folder holds something
+            else than such frames.
     """
     import cv2
 
     if every is not None and every < 1:
         raise InputError(f"--every: expected at least 1, got {every}")
-    if folder.is_dir():
-        return len(list(folder.glob("*.jpg")))
+    origin = _origin(video, every)
+    if os.path.lexists(folder):
+        known = _read_origin(folder)
+        if known is None:
+            raise InputError(f"{folder}: is there already, and holds no frames of a video; choose another --out")
+        if known == origin:
+            return len(list(folder.glob("*.jpg")))
     report = progress or (lambda done, total, text: None)
     capture = cv2.VideoCapture(str(video))
     try:
@@ -73,8 +86,27 @@ def extract_frames(video: Path, folder: Path, every: int | None = None, progress
     if kept < SHORTEST:
         shutil.rmtree(partial)
         raise InputError(f"{video}: {number} frames can be read, of which {kept} remain; convert it with ffmpeg")
+    (partial / NOTES).write_text(json.dumps(origin) + "\n", encoding="utf-8")
+    shutil.rmtree(folder, ignore_errors=True)
     os.replace(partial, folder)
     return kept
+
+
+def _origin(video: Path, every: int | None) -> dict[str, Any]:
+    """What tells frames of one video and interval from those of others."""
+    with reading(video):
+        facts = video.stat()
+    return {"video": video.name, "bytes": facts.st_size, "changed": facts.st_mtime_ns, "every": every}
+
+
+def _read_origin(folder: Path) -> dict[str, Any] | None:
+    """What the frames in a folder were taken from, or None if nothing tells."""
+    try:
+        with own_files():
+            notes = read_json(folder / NOTES)
+    except InputError:
+        return None
+    return notes if isinstance(notes, dict) else None
 
 
 def _sharpness(frame: np.ndarray) -> float:

@@ -293,33 +293,41 @@ class Film:
         pass
 
 
+@pytest.fixture
+def film_file(tmp_path):
+    """The file that a stand-in for OpenCV does not read."""
+    path = tmp_path / "film.mp4"
+    path.touch()
+    return path
+
+
 @pytest.mark.parametrize(
     ("count", "every", "kept"),
     [(30, None, 10), (450, None, 150), (600, None, 150), (1500, None, 150), (30, 1, 30), (31, 10, 4)],
 )
-def test_frames_of_a_video(monkeypatch, tmp_path, count, every, kept):
+def test_frames_of_a_video(monkeypatch, tmp_path, film_file, count, every, kept):
     """About 150 of them, but at most one of three, unless the interval is given."""
     written = []
     monkeypatch.setattr(cv2, "VideoCapture", lambda name: Film(count))
     monkeypatch.setattr(cv2, "imwrite", lambda name, frame, options: written.append((Path(name).name, options)))
-    assert video.extract_frames(tmp_path / "film.mp4", tmp_path / "frames", every) == kept
+    assert video.extract_frames(film_file, tmp_path / "frames", every) == kept
     assert [name for name, _ in written] == [f"{k:05d}.jpg" for k in range(kept)]
     assert all(options == [cv2.IMWRITE_JPEG_QUALITY, 95] for _, options in written)
 
 
-def test_a_video_of_few_frames_is_refused(monkeypatch, tmp_path):
+def test_a_video_of_few_frames_is_refused(monkeypatch, tmp_path, film_file):
     monkeypatch.setattr(cv2, "VideoCapture", lambda name: Film(6))
     monkeypatch.setattr(cv2, "imwrite", lambda *rest: True)
     with pytest.raises(InputError, match="6 frames can be read, of which 2 remain"):
-        video.extract_frames(tmp_path / "film.mp4", tmp_path / "frames")
+        video.extract_frames(film_file, tmp_path / "frames")
     assert not (tmp_path / "frames").exists()
     with pytest.raises(InputError, match="--every: expected at least 1, got 0"):
-        video.extract_frames(tmp_path / "film.mp4", tmp_path / "frames", 0)
+        video.extract_frames(film_file, tmp_path / "frames", 0)
 
 
-def test_the_sharpest_frame_stands_for_its_interval(monkeypatch, tmp_path):
+def test_the_sharpest_frame_stands_for_its_interval(monkeypatch, tmp_path, film_file):
     written = []
     monkeypatch.setattr(cv2, "VideoCapture", lambda name: Film(12, 4))
     monkeypatch.setattr(cv2, "imwrite", lambda name, frame, options: written.append(int(frame.max())))
-    assert video.extract_frames(tmp_path / "film.mp4", tmp_path / "frames", 4) == 3
+    assert video.extract_frames(film_file, tmp_path / "frames", 4) == 3
     assert written == [135] * 3
