@@ -1,8 +1,9 @@
 """Where surfaces are, from posed photographs alone: a plane sweep (Collins 1996) over small copies of them.
 
 Every photograph is compared with neighbors that were warped as if all they show lay on one plane parallel to its
-image, for many depths of the plane. Where the windows around a pixel agree best is its depth. Depths that other
-photographs contradict are dropped. No features, no network: what remains in even surfaces is a guess.
+image, for many depths of the plane. Where the windows around a pixel agree best is its depth. On larger copies it is
+then made finer, averaged over the photographs that agree, and dropped where others contradict it. No features, no
+network: what remains in even surfaces is a guess.
 """
 
 from __future__ import annotations
@@ -18,14 +19,16 @@ from numpy.typing import NDArray
 
 from sgwarp.ops.launcher import get_threads
 from sgwarp.reconstruction.stereo_agreement import UNSEEN, WINDOW, difference, least, together
-from sgwarp.reconstruction.stereo_refinement import refined
+from sgwarp.reconstruction.stereo_refinement import enlarged, refined
 from sgwarp.reconstruction.stereo_smoothing import smoothed
 from sgwarp.runs.progress import Report
 from sgwarp.scene import Camera
 
 Array = NDArray[Any]
 
-LONGEST = 160  # of the small copies, width or height [pixels]
+LONGEST = 160  # of the copies that planes are compared on, width or height [pixels]
+FINE = 320  # of those on which depth is made finer
+FINE_PIXELS = 8_000_000  # of all fine copies: they become smaller where photographs are many
 NEAREST, FARTHEST = 0.1, 30.0  # of the planes [extent of the cameras]
 RATIO = 1.055  # between the depths of two planes
 RANKS = (0, 1, 2, 4, 7, 11)  # of the neighbors among those that look the same way, by distance
@@ -33,6 +36,7 @@ LEAST_BASELINE = 0.02  # of a neighbor [extent of the cameras]
 LEAST_COSINE = 0.6  # between the directions of view of two neighbors
 AGREE, BEYOND = 0.04, 0.12  # relative differences of depth that confirm a point, and that contradict it
 LEAST_CONFIRMED = 2  # other photographs
+NEAR_JUDGES, FAR_JUDGES = 32, 16  # photographs that may confirm or contradict: the nearest, and some of the others
 
 
 @dataclass(frozen=True, eq=False)
@@ -41,7 +45,7 @@ class DepthMap:
 
     Attributes:
         camera: At the size of the map.
-        depth: Along the optical axis [world units], float32 [h, w].
+        depth: Along the optical axis, the mean of the photographs that agree [world units], float32 [h, w].
         colors: In [0, 1], float32 [h, w, 3].
         known: Pixels whose depth other photographs confirm and do not contradict, bool [h, w].
     """
@@ -69,37 +73,51 @@ def estimate_depth(
         progress: Called as `progress(done, total, text)`.
 
     Returns:
-        A map per photograph, at most 160 pixels wide and high.
+        A map per photograph, at most 320 pixels wide and high, and at most 160 if there are hundreds.
     """
     report = progress or (lambda done, total, text: None)
+    swept = [_small_size(camera, LONGEST) for camera in cameras]
+    sizes = [_small_size(camera, _fine_length(cameras)) for camera in cameras]
     # Room for all copies first: each one between two large images would keep the memory of those from being reused.
-    small = [np.empty((*_small_size(camera), 3), np.float32) for camera in cameras]
-    for copy, image in zip(small, images, strict=True):
-        copy[:] = _shrink(image, copy.shape[:2])
-    cameras = [camera.resized(*image.shape[:2]) for image, camera in zip(small, cameras, strict=True)]
-    gray = [np.ascontiguousarray(image.mean(axis=2)) for image in small]
+    colors = [np.empty((*size, 3), np.float32) for size in sizes]
+    coarse = [np.empty(size, np.float32) for size in swept]
+    for small, gray, image in zip(colors, coarse, images, strict=True):
+        small[:] = _shrink(image, small.shape[:2])
+        gray[:] = _shrink(image, gray.shape).mean(axis=2)
+    fine = [image.mean(axis=2) for image in colors]
+    coarse_cameras = [camera.resized(*size) for camera, size in zip(cameras, swept, strict=True)]
+    cameras = [camera.resized(*size) for camera, size in zip(cameras, sizes, strict=True)]
     neighbors = choose_neighbors(cameras, extent)
     planes = extent * np.exp(np.arange(math.log(NEAREST), math.log(FARTHEST), math.log(RATIO)))
 
     def depth_of(index: int) -> Array:
-        others = [(gray[other], cameras[other]) for other in neighbors[index]]
-        depth = _best(smoothed(_costs(gray[index], cameras[index], others, planes)), planes)
-        return refined(depth, gray[index], cameras[index], others)
+        others = [(coarse[other], coarse_cameras[other]) for other in neighbors[index]]
+        depth = _best(smoothed(_costs(coarse[index], coarse_cameras[index], others, planes)), planes)
+        others = [(fine[other], cameras[other]) for other in neighbors[index]]
+        return refined(enlarged(depth, sizes[index]), fine[index], cameras[index], others)
 
     depths: list[Array] = []
     with ThreadPoolExecutor(get_threads()) as pool:  # NumPy and OpenCV let go of the interpreter
-        for depth in pool.map(depth_of, range(len(small))):
-            report(len(depths), len(small), "comparing photographs")
+        for depth in pool.map(depth_of, range(len(fine))):
+            report(len(depths), len(fine), "comparing photographs")
             depths.append(depth)
+        judges = _choose_judges(cameras)
+        judged = list(pool.map(lambda index: _judge(index, judges[index], depths, cameras), range(len(fine))))
     return [
-        DepthMap(camera, depth, image, _confirmed(index, depths, cameras))
-        for index, (camera, depth, image) in enumerate(zip(cameras, depths, small, strict=True))
+        DepthMap(camera, depth, image, known)
+        for camera, image, (depth, known) in zip(cameras, colors, judged, strict=True)
     ]
 
 
-def _small_size(camera: Camera) -> tuple[int, int]:
+def _fine_length(cameras: Sequence[Camera]) -> int:
+    """Width or height of the fine copies, whichever is more [pixels]."""
+    shape = sum(min(camera.size) / max(camera.size) for camera in cameras)
+    return int(min(FINE, max(LONGEST, math.sqrt(FINE_PIXELS / max(shape, 1e-9)))))
+
+
+def _small_size(camera: Camera, longest: int) -> tuple[int, int]:
     """(height, width) of the copy of a photograph."""
-    factor = min(1.0, LONGEST / max(camera.size))
+    factor = min(1.0, longest / max(camera.size))
     height, width = (max(WINDOW, round(factor * size)) for size in camera.size)
     return height, width
 
@@ -170,13 +188,25 @@ def unproject(camera: Camera, depth: Array) -> Array:
     return (rays * depth.reshape(-1, 1) - pose[:3, 3]) @ pose[:3, :3]
 
 
-def _confirmed(index: int, depths: Sequence[Array], cameras: Sequence[Camera]) -> Array:
-    """Which pixels of a map other maps confirm, more of them than see through the point."""
+def _choose_judges(cameras: Sequence[Camera]) -> list[Array]:
+    """Of each camera, those that may confirm or contradict its depth: the nearest, and some of all the others."""
+    places = np.stack([camera.position.numpy() for camera in cameras])
+    chosen = []
+    for index, place in enumerate(places):
+        order = np.argsort(np.linalg.norm(places - place, axis=1), kind="stable")
+        order = order[order != index]
+        far = np.linspace(NEAR_JUDGES, len(order) - 1, FAR_JUDGES) if len(order) > NEAR_JUDGES else np.empty(0)
+        chosen.append(np.concatenate([order[:NEAR_JUDGES], order[np.unique(far.astype(np.int64))]]))
+    return chosen
+
+
+def _judge(index: int, judges: Array, depths: Sequence[Array], cameras: Sequence[Camera]) -> tuple[Array, Array]:
+    """Depth averaged over the maps that agree with a map, and the pixels that more of them confirm than see through."""
+    own = depths[index].reshape(-1).astype(np.float64)
     points = unproject(cameras[index], depths[index])
-    agreeing, beyond = np.zeros(len(points), np.int32), np.zeros(len(points), np.int32)
-    for other, (depth, camera) in enumerate(zip(depths, cameras, strict=True)):
-        if other == index:
-            continue
+    total, agreeing, beyond = own.copy(), np.zeros(len(own), np.int32), np.zeros(len(own), np.int32)
+    for other in judges:
+        depth, camera = depths[other], cameras[other]
         pose = camera.world_to_camera.numpy()
         seen = points @ pose[:3, :3].T + pose[:3, 3]
         front = np.flatnonzero(seen[:, 2] > 0)
@@ -185,6 +215,11 @@ def _confirmed(index: int, depths: Sequence[Array], cameras: Sequence[Camera]) -
         inside = (column >= 0) & (column < camera.width) & (row >= 0) & (row < camera.height)
         front, column, row = front[inside], column[inside], row[inside]
         ratio = seen[front, 2] / depth[row, column]
-        agreeing[front] += np.abs(ratio - 1) < AGREE
         beyond[front] += ratio < 1 - BEYOND
-    return ((agreeing >= LEAST_CONFIRMED) & (beyond <= agreeing)).reshape(depths[index].shape)
+        near = np.abs(ratio - 1) < AGREE
+        agrees = front[near]
+        total[agrees] += own[agrees] / ratio[near]  # as if the surface were parallel to both images
+        agreeing[agrees] += 1
+    shape = depths[index].shape
+    known = (agreeing >= LEAST_CONFIRMED) & (beyond <= agreeing)
+    return (total / (1 + agreeing)).astype(np.float32).reshape(shape), known.reshape(shape)

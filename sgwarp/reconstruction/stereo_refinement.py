@@ -19,7 +19,7 @@ from sgwarp.scene import Camera
 
 Array = NDArray[Any]
 
-STEPS = (0.008, 0.003)  # between two moves, of each pass, relative to the depth
+STEPS = (0.012, 0.004)  # between two moves, of each pass, relative to the depth
 MOVES = 3  # to either side
 MEDIAN = 5  # of pixels beside each other, width
 
@@ -46,6 +46,13 @@ def refined(depth: Array, image: Array, camera: Camera, others: Sequence[tuple[A
                 costs[number, place] = difference(image, warped)
         depth = (surface * (1 + step * least(smoothed(together(costs))))).astype(np.float32)
     return depth
+
+
+def enlarged(depth: Array, size: tuple[int, int]) -> Array:
+    """A depth map of another size, float32 [h, w], without its single wrong pixels."""
+    import cv2
+
+    return np.asarray(cv2.resize(cv2.medianBlur(depth, MEDIAN), size[::-1], interpolation=cv2.INTER_LINEAR))
 
 
 def _warped(other: Array, its_camera: Camera, camera: Camera, surface: Array, moves: Array) -> Any:

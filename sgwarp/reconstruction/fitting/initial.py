@@ -1,4 +1,4 @@
-"""Initial Gaussians: at points from structure from motion, or at random inside the camera frusta."""
+"""Initial Gaussians: at points from structure from motion, on surfaces where photographs agree, or at random."""
 
 from __future__ import annotations
 
@@ -13,14 +13,14 @@ from torch import Tensor
 
 from sgwarp.errors import InputError
 from sgwarp.ops.neighbors import mean_squared_neighbor_distance
-from sgwarp.reconstruction.depth import SH_C0
+from sgwarp.reconstruction.depth import SH_C0, gaussians_from_depth
 from sgwarp.reconstruction.fitting.belongings import depth_from_folder as depth_from_folder
 from sgwarp.reconstruction.fitting.photographs import Photograph
 from sgwarp.reconstruction.fitting.settings import FitSettings
 from sgwarp.reconstruction.stereo import estimate_depth
 from sgwarp.runs.progress import Report
 from sgwarp.runs.seeds import generator
-from sgwarp.scene import SH_COUNTS, Gaussians
+from sgwarp.scene import SH_COUNTS, Gaussians, View, join_gaussians
 
 logger = logging.getLogger("sgwarp")
 OPACITY = {"default": 0.1, "mcmc": 0.5}  # of the reference implementations
@@ -96,10 +96,10 @@ def checked_points(positions: Any, colours: Any) -> tuple[Tensor, Tensor]:
     return positions, colours
 
 
-def random_points(
-    photographs: Sequence[Photograph], settings: FitSettings, progress: Report | None = None
-) -> tuple[Tensor, Tensor, float]:
-    """Random pixels of the photographs at the depth where others agree with them, with their colors.
+def gaussians_from_photographs(
+    photographs: Sequence[Photograph], settings: FitSettings, extent: float, progress: Report | None = None
+) -> Gaussians:
+    """Flat Gaussians on the surfaces on whose depth the photographs agree, with their colors.
 
     Points anywhere on their rays explain the photographs they come from and hide the scene from the others: a fit then
     ends in fog. Only where photographs agree nowhere is that what remains; distances are then spread evenly by their
@@ -107,20 +107,17 @@ def random_points(
 
     Args:
         photographs: With cameras in the frame of the fit.
-        settings: Cap and seed.
+        settings: Strategy, cap and seed.
+        extent: Of the cameras [m].
         progress: Called as `progress(done, total, text)`.
-
-    Returns:
-        Positions, float64 [N, 3], colors in [0, 1], float32 [N, 3], and the size of Gaussians there, in root mean
-        square distances to the three nearest others.
     """
     count = _most_points(settings)
-    random = generator(settings.seed, 0, "random points")
-    places, colors = _points_where_photographs_agree(photographs, count, random, progress)
-    if len(places) >= LEAST_CERTAIN:
-        return places, colors, SIZE
+    found = _surfaces(photographs, count, settings, progress)
+    if found is not None:
+        return found
     logger.warning("start: the photographs agree nowhere, so points lie anywhere in view; the fit may end in fog")
-    return *_points_anywhere(photographs, count, random), RANDOM_SIZE
+    places, colors = _points_anywhere(photographs, count, generator(settings.seed, 0, "random points"))
+    return gaussians_from_points(places, colors, settings, extent, size=RANDOM_SIZE)
 
 
 def _most_points(settings: FitSettings) -> int:
@@ -129,30 +126,46 @@ def _most_points(settings: FitSettings) -> int:
 
 
 def completed(
-    positions: Tensor, colors: Any, photographs: Sequence[Photograph], settings: FitSettings, progress: Report
-) -> tuple[Tensor, Tensor]:
-    """Few points, such as features leave them, and more of those where photographs agree."""
-    random = generator(settings.seed, 0, "more points")
-    count = _most_points(settings) - len(positions)
-    more, their_colors = _points_where_photographs_agree(photographs, count, random, progress)
-    logger.info("start: %d points are few; %d are added where photographs agree", len(positions), len(more))
-    own = torch.as_tensor(colors).to(torch.float32)
-    return torch.cat([positions, more]), torch.cat([own, their_colors])
+    positions: Tensor,
+    colors: Any,
+    photographs: Sequence[Photograph],
+    settings: FitSettings,
+    extent: float,
+    progress: Report,
+) -> Gaussians:
+    """Gaussians at few points, such as features leave them, and on the surfaces where photographs agree."""
+    more = _surfaces(photographs, _most_points(settings) - len(positions), settings, progress)
+    added = 0 if more is None else len(more)
+    logger.info("start: %d points are few; %d are added where photographs agree", len(positions), added)
+    if more is None:
+        return gaussians_from_points(positions, colors, settings, extent)
+    every = torch.cat([positions, more.means.to(positions.dtype)])
+    # Sizes by the distances to both: a sparse point is no large ball in front of a surface.
+    distance = mean_squared_neighbor_distance(every).sqrt().clamp(min=LEAST_DISTANCE * extent)[: len(positions)]
+    own = gaussians_from_points(positions, colors, settings, extent)
+    own = replace(own, scales=(SIZE * distance)[:, None].expand(-1, 3).to(torch.float32))
+    return join_gaussians([own, more])
 
 
-def _points_where_photographs_agree(
-    photographs: Sequence[Photograph], count: int, random: torch.Generator, progress: Report | None
-) -> tuple[Tensor, Tensor]:
-    """At most `count` pixels at their depth, and their colors."""
+def _surfaces(
+    photographs: Sequence[Photograph], count: int, settings: FitSettings, progress: Report | None
+) -> Gaussians | None:
+    """At most `count` Gaussians where photographs agree; None if that is next to nowhere."""
     images = (photograph.image().cpu().numpy() for photograph in photographs)
     maps = estimate_depth(images, [photograph.camera for photograph in photographs], 1.0, progress)
-    known = [m.known & _counted(photograph, m.known.shape) for m, photograph in zip(maps, photographs, strict=True)]
-    places = torch.from_numpy(np.concatenate([m.points[own.reshape(-1)] for m, own in zip(maps, known, strict=True)]))
-    colors = torch.from_numpy(np.concatenate([m.colors[own] for m, own in zip(maps, known, strict=True)]))
     share = sum(float(m.known.mean()) for m in maps) / len(maps)
     logger.info("start: the photographs agree on the depth of %.0f %% of their pixels", 100 * share)
-    chosen = torch.randperm(len(places), generator=random)[:count].sort().values
-    return places[chosen], colors[chosen]
+    known = [m.known & _counted(photograph, m.known.shape) for m, photograph in zip(maps, photographs, strict=True)]
+    if count < 1 or sum(int(own.sum()) for own in known) < LEAST_CERTAIN:
+        return None
+    views = [View(str(index), m.camera) for index, m in enumerate(maps)]
+    return gaussians_from_depth(
+        views,
+        lambda view: np.where(known[int(view.stem)], maps[int(view.stem)].depth, 0.0),
+        lambda view: maps[int(view.stem)].colors,
+        count=count,
+        opacity=OPACITY[settings.strategy],
+    )
 
 
 def _counted(photograph: Photograph, size: tuple[int, ...]) -> Any:

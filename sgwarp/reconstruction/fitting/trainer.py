@@ -18,8 +18,8 @@ from sgwarp.reconstruction.fitting.initial import (
     adapted,
     checked_points,
     completed,
+    gaussians_from_photographs,
     gaussians_from_points,
-    random_points,
 )
 from sgwarp.reconstruction.fitting.loop import Loop
 from sgwarp.reconstruction.fitting.measurement import Measurement as Measurement
@@ -206,11 +206,10 @@ def _starting(
         require_overlap(photographs, gaussians.means, held_out)
         return gaussians
     if start is None:
-        positions, colours, size = random_points(photographs, settings, report)
-        return gaussians_from_points(positions, colours, settings, EXTENT, device, size)
+        return gaussians_from_photographs(photographs, settings, EXTENT, report).to(device)
     positions, colours = checked_points(*start)
     positions = frame.points(positions)
     require_overlap(photographs, positions.to(torch.float32), held_out)  # before the cap thins them
     if len(positions) < min(FEW_POINTS, settings.cap // 2):
-        positions, colours = completed(positions, colours, photographs, settings, report)
+        return completed(positions, colours, photographs, settings, EXTENT, report).to(device)
     return gaussians_from_points(positions, colours, settings, EXTENT, device)

@@ -17,7 +17,7 @@ from sgwarp.errors import InputError
 from sgwarp.io.points import load_points
 from sgwarp.reconstruction.fitting.coverage import in_view, seen_by_any
 from sgwarp.reconstruction.fitting.frame import Frame
-from sgwarp.reconstruction.fitting.initial import random_points
+from sgwarp.reconstruction.fitting.initial import gaussians_from_photographs
 from sgwarp.reconstruction.fitting.photographs import read_photographs, require_overlap
 from sgwarp.reconstruction.fitting.pixels import PixelStore
 from sgwarp.reconstruction.fitting.settings import FitSettings
@@ -110,10 +110,11 @@ def test_photographs_beyond_the_memory_are_read_from_a_file():
 
 
 @pytest.mark.slow
-def test_random_points_lie_on_surfaces_where_photographs_agree(boards):
+def test_a_fit_without_points_starts_on_surfaces_where_photographs_agree(boards):
     frame = Frame.around(boards.views)
-    positions, _, _ = random_points(read_photographs([*map(frame.view, boards.views)]), FitSettings(cap=4000))
-    depth = (positions * frame.scale + frame.origin)[:, 2]
+    photographs = read_photographs([*map(frame.view, boards.views)])
+    found = gaussians_from_photographs(photographs, FitSettings(cap=4000), 1.0)
+    depth = (found.means.double() * frame.scale + frame.origin)[:, 2]
     off = torch.stack([(depth - z).abs() for z in (4.0, 3.0, 2.6)]).amin(dim=0)
     assert off.median() < 0.15
 

@@ -35,14 +35,14 @@ from sgwarp.scene import Gaussians
 def test_points_that_are_made_leave_a_strategy_its_room(monkeypatch, strategy, cap, most):
     asked = []
 
-    def agree(photographs, wanted, random, progress):
+    def surfaces(photographs, wanted, settings, progress):
         asked.append(wanted)
-        return torch.zeros(600, 3), torch.zeros(600, 3)
+        return initial.gaussians_from_points(np.zeros((600, 3)), np.zeros((600, 3)), settings, 1.0)
 
-    monkeypatch.setattr(initial, "_points_where_photographs_agree", agree)
+    monkeypatch.setattr(initial, "_surfaces", surfaces)
     settings = FitSettings(strategy=strategy, cap=cap)
-    initial.random_points([], settings)
-    initial.completed(torch.zeros(7, 3), torch.zeros(7, 3), [], settings, lambda *call: None)
+    initial.gaussians_from_photographs([], settings, 1.0)
+    initial.completed(torch.zeros(7, 3), torch.zeros(7, 3), [], settings, 1.0, lambda *call: None)
     assert asked == [most, most - 7]
 
 
@@ -59,11 +59,11 @@ def test_points_that_are_made_leave_a_strategy_its_room(monkeypatch, strategy, c
 def test_few_points_are_added_to(monkeypatch, points, cap, more):
     added = []
     monkeypatch.setattr(trainer, "require_overlap", lambda *rest: None)
-    monkeypatch.setattr(trainer, "completed", lambda *rest: added.append(1) or rest[:2])
-    monkeypatch.setattr(trainer, "gaussians_from_points", lambda positions, *rest: len(positions))
+    monkeypatch.setattr(trainer, "completed", lambda *rest: added.append(1) or torch.zeros(len(rest[0])))
+    monkeypatch.setattr(trainer, "gaussians_from_points", lambda positions, *rest: torch.zeros(len(positions)))
     frame = SimpleNamespace(points=lambda positions: positions)
     given = np.zeros((points, 3)), np.zeros((points, 3), np.float32)
-    assert trainer._starting(given, [], [], frame, FitSettings(cap=cap), None, "cpu") == points
+    assert len(trainer._starting(given, [], [], frame, FitSettings(cap=cap), None, "cpu")) == points
     assert bool(added) == more
 
 

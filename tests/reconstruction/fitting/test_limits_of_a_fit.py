@@ -10,6 +10,7 @@ import torch
 
 from sgwarp.errors import InputError
 from sgwarp.files.images import write_rgb
+from sgwarp.ops.neighbors import mean_squared_neighbor_distance
 from sgwarp.reconstruction import depth as depth_module
 from sgwarp.reconstruction.depth_unit import DepthUnit
 from sgwarp.reconstruction.fitting import depth_start, initial, trainer
@@ -21,6 +22,7 @@ from sgwarp.reconstruction.fitting.pixels import IN_MEMORY, PixelStore
 from sgwarp.reconstruction.fitting.report import sheet_rows
 from sgwarp.reconstruction.fitting.settings import FitSettings
 from sgwarp.reconstruction.fitting.trainer import fit
+from sgwarp.reconstruction.stereo import DepthMap
 from sgwarp.runs.log import RunLog
 from sgwarp.scene import Camera, Gaussians, View
 
@@ -172,12 +174,22 @@ def test_the_unit_of_the_depth_is_said_and_applied(monkeypatch, caplog, found, f
     assert (said in caplog.text) if said else not caplog.records
 
 
-@pytest.mark.parametrize(("found", "size"), [(499, 0.35), (500, 1.0)])
-def test_random_points_are_small_where_photographs_agree_nowhere(monkeypatch, caplog, found, size):
-    monkeypatch.setattr(initial, "_points_where_photographs_agree", lambda *rest: (torch.zeros(found, 3), None))
-    monkeypatch.setattr(initial, "_points_anywhere", lambda *rest: (torch.zeros(9, 3), None))
-    assert initial.random_points([], FitSettings())[2] == size
-    assert ("the fit may end in fog" in caplog.text) == (size < 1)
+@pytest.mark.parametrize(("known", "fog"), [(499, True), (500, False)])
+def test_points_lie_anywhere_and_small_where_photographs_agree_nowhere(monkeypatch, caplog, known, fog):
+    photographs = [black(0.0), black(0.0), black(0.0)]
+    agreed = np.zeros((30, 40), bool)
+    agreed.reshape(-1)[:known] = True
+    depth, colors = np.full((30, 40), 2.0, np.float32), np.zeros((30, 40, 3), np.float32)
+    maps = [DepthMap(camera(), depth, colors, agreed & (index == 0)) for index in range(3)]
+    monkeypatch.setattr(initial, "estimate_depth", lambda *rest: maps)
+    found = initial.gaussians_from_photographs(photographs, FitSettings(cap=300), 1.0)
+    assert ("the fit may end in fog" in caplog.text) == fog
+    if fog:
+        assert len(found) == 300
+        distance = mean_squared_neighbor_distance(found.means.double()).sqrt().float()
+        torch.testing.assert_close(found.scales, (0.35 * distance)[:, None].expand(-1, 3))
+    else:
+        torch.testing.assert_close(found.means[:, 2], torch.full((len(found),), 2.0))
 
 
 def test_points_anywhere_lie_between_a_fifth_and_four_extents():
