@@ -138,11 +138,11 @@ def test_depth_that_contradicts_itself_is_not_started_from(boards, tmp_path, cap
 
 @pytest.mark.parametrize(("strategy", "count"), [("default", 250), ("mcmc", 500)])
 def test_a_fit_starts_from_nothing(boards, tmp_path, strategy, count):
-    """A random start takes the cap, or half of it where Gaussians are added later."""
+    """What photographs agree on fills nearly the cap, or half of it where Gaussians are added later."""
     out = tmp_path / "scene.ply"
     options = ["--init", "random", "--steps", "3", "--cap", "500", "--downscale", "2", "--strategy", strategy]
     assert main(["fit", str(boards.folder), "--out", str(out), *options, "--background", "random", "--exposure"]) == 0
-    assert len(load_gaussians(out)) == count
+    assert 0.85 * count < len(load_gaussians(out)) <= count
 
 
 @pytest.mark.parametrize(
