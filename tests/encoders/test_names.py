@@ -231,6 +231,19 @@ def made(monkeypatch):
     return build
 
 
+@pytest.mark.parametrize("given", ["", "?background=yes", "?background=no"])
+def test_what_surrounds_a_mask_stays_visible_unless_told_otherwise(made, given):
+    source = made("images.clip.JointEncoder", f"clip:P+graph{given}").source
+    assert source.encoder.background == (given != "?background=no")
+    assert source.levels == ("default",)
+
+
+def test_without_masks_a_network_of_pixels_stands_alone(made):
+    assert isinstance(made("images.clip.JointEncoder", "clip:P?rule=pixels").source, PlainPixels)
+    refined = made("images.clip.JointEncoder", "clip:P?rule=pixels+slic").source
+    assert (type(refined), refined.generator.method, refined.rest) == (RefinedPixels, "slic", "cells")
+
+
 def test_options_reach_the_networks(made):
     assert made("images.clip.JointEncoder", "clip:P?longest=448").longest == 448
     assert not hasattr(made("images.clip.JointEncoder", "clip:P"), "longest")
