@@ -143,7 +143,9 @@ def test_siglip2_is_given_patches_row_by_row(joint_models):
     encoder = JointEncoder(str(joint_models["siglip2"]))
     images = torch.rand(2, 3, 16, 40, generator=torch.Generator().manual_seed(0))
     found = encoder._inputs(images)
-    values = (images - torch.tensor([0.48, 0.45, 0.40])[:, None, None]) / torch.tensor([0.26, 0.25, 0.27])[:, None, None]
+    values = (images - torch.tensor([0.48, 0.45, 0.40])[:, None, None]) / torch.tensor([0.26, 0.25, 0.27])[
+        :, None, None
+    ]
     assert found["pixel_values"].shape == (2, 2 * 5, 8 * 8 * 3)
     torch.testing.assert_close(found["pixel_values"][1, 7], values[1, :, 8:16, 16:24].permute(1, 2, 0).flatten())
     assert torch.equal(found["pixel_attention_mask"], torch.ones(2, 10, dtype=torch.int64))

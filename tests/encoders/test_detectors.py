@@ -131,7 +131,7 @@ def test_prompts_hold_the_names_in_their_order(gdino):
     found = list(encoder._fill_prompts("gdino"))
     assert len(found) == len(wanted)
     for (first, tokens, owners), (start, words, classes) in zip(found, wanted, strict=True):
-        ids = torch.tensor([[101, *sum(words, []), 102]])
+        ids = torch.tensor([[101, *(word for name in words for word in name), 102]])
         assert (first, owners.tolist()) == (start, classes)
         assert torch.equal(tokens["input_ids"], ids)
         assert torch.equal(tokens["attention_mask"], torch.ones_like(ids))
@@ -177,6 +177,13 @@ def test_owlv2(owlv2, tools, view, image):
 def test_detectors_need_names(encoder):
     with pytest.raises(InputError, match="needs the names to look for"):
         encoder("somewhere", ())
+
+
+def test_owlv2_has_one_template(owlv2):
+    for templates in ((), ("{}", "the {}")):
+        with pytest.raises(InputError, match="needs the names to look for, and one template"):
+            Owlv2(str(owlv2), ("couch",), templates)
+    assert Owlv2(str(owlv2), ("couch " * 40,)).settings == DetectorSettings(0.1, 0.7)  # a long name is cut
 
 
 @pytest.mark.slow
@@ -237,6 +244,11 @@ def test_clipseg(clipseg, tools, image):
         answer = model(input_ids=tokens, attention_mask=(tokens > 0).long(), pixel_values=values.expand(2, -1, -1, -1))
     torch.testing.assert_close(found, answer.logits.sigmoid().permute(1, 2, 0), rtol=1e-3, atol=1e-5)
     assert not torch.allclose(found[..., 0], found[..., 1])
+    both = ClipSeg(str(clipseg), ("couch", "teddy bear"), ("{}", "a photo of a {}")).encode_pixels(image)
+    other = ClipSeg(str(clipseg), ("couch", "teddy bear"), ("a photo of a {}",)).encode_pixels(image)
+    torch.testing.assert_close(both, (found + other) / 2, rtol=1e-4, atol=1e-6)
+    long, cut = (ClipSeg(str(clipseg), ("couch " * count,)).encode_pixels(image) for count in (40, 14))
+    torch.testing.assert_close(long, cut, rtol=1e-4, atol=1e-6)  # 16 tokens with their marks
     with pytest.raises(InputError, match="needs the phrases to look for"):
         ClipSeg(str(clipseg), ())
 

@@ -59,6 +59,63 @@ def test_run_lengths_of_random_masks():
         np.testing.assert_array_equal(decode_rle({"size": mask.shape, "counts": as_text(runs(mask))}), mask)
 
 
+@pytest.mark.parametrize(
+    ("size", "counts", "message"),
+    [
+        ([0, 5], [], "a mask of 0 x 5 pixels"),
+        ([5, 0], [0], "a mask of 5 x 0 pixels"),
+        ([-2, -3], [6], "a mask of -2 x -3 pixels"),
+        ([10**6, 10**6], [10**12], "a mask of 1000000 x 1000000 pixels"),
+        ([2, 2], [], "run lengths add up to 0, not 2 x 2"),
+        ([2, 2], [5, -2, 1], "run lengths add up to 4, not 2 x 2"),
+        ([2, 2], [5], "run lengths add up to 5"),
+        ([2, 2], "/", "stands for no run length"),
+        ([2, 2], "p", "stands for no run length"),
+        ([2, 2], "\x94", "stands for no run length"),
+    ],
+)
+def test_run_lengths_of_no_mask(size, counts, message):
+    with pytest.raises(ValueError, match=message):
+        decode_rle({"size": size, "counts": counts})
+
+
+def test_the_last_character_of_all_goes_on():
+    """Six bits set: a run that never ends."""
+    with pytest.raises(IndexError):
+        decode_rle({"size": [2, 2], "counts": "o"})
+
+
+@pytest.mark.parametrize(("rows", "fits"), [(25, True), (23, True), (26, False), (22, False)])
+def test_masks_may_be_off_by_a_pixel(tmp_path, view, image, rows, fits):
+    """Of an image of 64 x 48, 32 x 24 pixels are expected: sizes are rounded."""
+    masks = np.ones((1, rows, 32), bool)
+    for folder in ("found", "masks"):
+        (tmp_path / folder).mkdir()
+    np.savez(tmp_path / "masks" / "a.npz", masks=masks)
+    np.savez(tmp_path / "found" / "a.npz", masks=masks, boxes=[[0.0, 0, 5, 5]], names=np.array(["x"]), scores=[1.0])
+    instances, generator = VLPartFiles(tmp_path / "found"), FileMasks(tmp_path / "masks")
+    for read in (lambda: instances.find(view, image), lambda: generator.everything(view, image)):
+        if fits:
+            assert read().masks.shape == (1, rows, 32)
+        else:
+            with pytest.raises(InputError, match=f"32 x {rows}, not the shape of view a"):
+                read()
+
+
+def test_masks_of_instances_have_three_axes(tmp_path, view, image):
+    arrays = {"boxes": [[0.0, 0, 5, 5]], "names": np.array(["x"]), "scores": [1.0]}
+    np.savez(tmp_path / "a.npz", masks=np.ones((1, 48), bool), **arrays)
+    with pytest.raises(InputError, match=r"a\.npz: expected masks \[K, h, w\], got \[1, 48\]"):
+        VLPartFiles(tmp_path).find(view, image)
+
+
+@pytest.mark.parametrize("suffix", [".json", ".npz"])
+def test_a_file_of_either_kind_is_enough(tmp_path, view, suffix):
+    assert not VLPartFiles(tmp_path).has_map(view)
+    (tmp_path / f"a{suffix}").touch()
+    assert VLPartFiles(tmp_path).has_map(view)
+
+
 ROWS = [
     {"box": [5, 10, 40, 30], "name": "dog:head", "score": 0.9},
     {"box": [1.5, 2, 60, 44], "name": "dog_tail", "score": 0.3},
@@ -270,6 +327,7 @@ def test_masks_of_label_images(tmp_path, view, image):
     found = FileMasks(tmp_path).everything(view, image)
     np.testing.assert_array_equal(found.masks, np.stack([ids == 3, ids == 7]))
     assert found.ranks.tolist() == [UNRANKED] * 2
+    assert found.scores.tolist() == [1.0, 1.0]
 
 
 def test_stacks_of_masks(tmp_path, view, image):
@@ -310,8 +368,8 @@ def test_missing_masks(tmp_path, view, image):
 
 def test_feature_3dgs(tmp_path, tools):
     view = tools.make_view(40, 40)
-    features = torch.randn(6, 20, 20).half()
+    features = torch.randn(20, 20, 20).half()
     torch.save(features, tmp_path / "a_fmap_CxHxW.pt")
     source = FileMaps(tmp_path, [view])
     assert torch.equal(source.encode(view).dense, features.permute(1, 2, 0))  # square: only the name tells the layout
-    assert source.space == "files:6"
+    assert source.space == "files:20"

@@ -249,6 +249,8 @@ def test_options_reach_the_networks(made):
     assert not hasattr(made("images.clip.JointEncoder", "clip:P"), "longest")
     call = made("pixels.lseg.LSeg", "lseg:P?longest=300&tokenizer=T")
     assert (call.longest, call.tokenizer) == (300, "T")
+    call = made("pixels.clipseg.ClipSeg", "clipseg:P?classes=a,b")
+    assert call.arguments == ("P", ("a", "b"))
     call = made("maps.closed_set.ClosedSet", "mask2former:P?least=0.7&longest=320")
     assert (call.arguments, call.least, call.longest) == (("P",), 0.7, 320)
 
