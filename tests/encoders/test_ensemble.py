@@ -157,6 +157,17 @@ def test_dense_maps_of_two_sizes():
         assert found.valid is None
 
 
+@pytest.mark.parametrize("kind", ["ids", "dense"])
+@pytest.mark.parametrize("order", [1, -1])
+def test_the_map_with_the_most_pixels_gives_the_size(kind, order):
+    """Not the one with the most rows."""
+    maps = []
+    for size in ((4, 40), (5, 8))[::order]:
+        parts = {"ids": ids(size, 3, 0), "vectors": unit(3, 4)} if kind == "ids" else {"dense": unit(*size, 4)}
+        maps.append(FeatureMap("one", **parts))
+    assert join_maps("both", maps, (0.5, 0.5)).size == (4, 40)
+
+
 @pytest.mark.parametrize("needed", [(True, True), (True, False), (False, True), (False, False)])
 def test_the_photograph_is_needed_if_a_member_needs_it(pair, needed):
     for member, needs in zip(pair, needed, strict=True):

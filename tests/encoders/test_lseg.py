@@ -176,6 +176,16 @@ def test_transformer_against_plain_formulas(checkpoint, weights):
     torch.testing.assert_close(maps[2][0], wanted, rtol=1e-9, atol=1e-9)
 
 
+@pytest.mark.parametrize(
+    "shape",
+    [LSegShape(), LSegShape(64, 4, 1, 8, 2, (4, 5, 6, 7), 3, 9), LSegShape(32, 8, 1, 4, 5, (1, 2, 3, 4), 6, 5)],
+)
+def test_sizes_are_read_off_the_parameters(shape):
+    with torch.device("meta"):
+        network = LSegNetwork(shape)
+    assert LSegShape.of(network.state_dict()) == shape
+
+
 def test_fusion_against_plain_formulas():
     torch.manual_seed(0)
     fusion = Fusion(3).double().eval()

@@ -1,4 +1,4 @@
-"""What was made of photographs as they are stored is turned and undistorted with them, unless it is straight already."""
+"""What was made of photographs as stored is turned and undistorted with them, unless it is straight already."""
 
 from pathlib import Path
 
