@@ -249,6 +249,8 @@ def test_bad_places(tmp_path):
     (tmp_path / "file").touch()
     with pytest.raises(InputError, match=r"cannot be made .*; choose another, or none"):
         CachedMaps(Source(), tmp_path / "file" / "below")
+    with pytest.raises(InputError, match=r"cannot be made \(File exists\)"):
+        CachedMaps(Source(), tmp_path / "file")
     with pytest.raises(InputError, match="limit above 0"):
         CachedMaps(Source(), tmp_path, limit=0.0)
 

@@ -64,7 +64,7 @@ def test_run_lengths_of_random_masks():
         ([0, 5], [], "a mask of 0 x 5 pixels"),
         ([5, 0], [0], "a mask of 5 x 0 pixels"),
         ([-2, -3], [6], "a mask of -2 x -3 pixels"),
-        ([10**6, 10**6], [10**12], "a mask of 1000000 x 1000000 pixels"),
+        ([10**6, 10**6], [4], "a mask of 1000000 x 1000000 pixels"),
         ([2, 2], [], "run lengths add up to 0, not 2 x 2"),
         ([2, 2], [5, -2, 1], "run lengths add up to 4, not 2 x 2"),
         ([2, 2], [5], "run lengths add up to 5"),

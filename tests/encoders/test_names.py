@@ -249,6 +249,9 @@ def test_options_reach_the_networks(made):
     assert not hasattr(made("images.clip.JointEncoder", "clip:P"), "longest")
     call = made("pixels.lseg.LSeg", "lseg:P?longest=300&tokenizer=T")
     assert (call.longest, call.tokenizer) == (300, "T")
+    for given, pooled in (("", True), ("?pooled=yes", True), ("?pooled=no", False)):
+        call = made("pixels.openseg.OpenSeg", f"openseg:P{given}+text:conse")
+        assert (call.arguments[0], call.arguments[1].space, call.arguments[2]) == ("P", KINDS["conse"].space, pooled)
     call = made("pixels.clipseg.ClipSeg", "clipseg:P?classes=a,b")
     assert call.arguments == ("P", ("a", "b"))
     call = made("maps.closed_set.ClosedSet", "mask2former:P?least=0.7&longest=320")
