@@ -108,14 +108,16 @@ def own(part: Part, settings: Any) -> dict[str, Any]:
 
 def levels_of(part: Part) -> tuple[str, ...]:
     """Levels of the masks that are asked for."""
-    return tuple(part.options.get("levels", ("default",)))
+    levels: tuple[str, ...] = part.options.get("levels", ("default",))
+    return levels
 
 
 def source_of_pixels(encoder: PixelEncoder, masks: Part | None, request: Request) -> MapSource:
     """A pixel-level network, refined by masks if there are some."""
-    generator = request.masks(masks)
-    if masks is None or generator is None:
+    if masks is None:
         return PlainPixels(encoder)
+    generator = request.masks(masks)
+    assert generator is not None
     return RefinedPixels(encoder, generator, masks.options.get("rest", "cells"))
 
 

@@ -72,10 +72,12 @@ class Ensemble:
 
     def encode(self, view: View, image: Tensor | None) -> FeatureMap:
         """The members' maps put together: an id map if all are id maps, else a dense one."""
-        maps = [member.encode(view, image) for member in self.members]
-        for found, member in zip(maps, self.members, strict=True):
+        maps = []
+        for member in self.members:
+            found = member.encode(view, image)
             if found.space != member.space:
                 raise InputError(f"ensemble: space '{member.space}' gave a map in space '{found.space}'")
+            maps.append(found)
         return join_maps(self.space, maps, self.weights)
 
     def encode_text(self, texts: Sequence[str]) -> Tensor:
@@ -116,22 +118,18 @@ def join_maps(space: str, maps: Sequence[FeatureMap], weights: Sequence[float]) 
     """
     if any(found.dense is not None for found in maps):
         return _join_dense(space, maps, weights)
-    levels = max(found.ids.shape[0] for found in maps if found.ids is not None)
     size = max((found.size for found in maps), key=lambda size: size[0] * size[1])
-    channels = sum(found.channels for found in maps)
+    all_ids = [_ids_at(found, size) for found in maps]
+    levels = max(len(ids) for ids in all_ids)
     joint = torch.zeros(levels, *size, dtype=torch.int64)
-    vectors = torch.zeros(1, channels)
-    first = 0
-    for found, weight in zip(maps, weights, strict=True):
-        ids = _ids_at(found, size)
+    vectors = torch.empty(1, 0)
+    for found, ids, weight in zip(maps, all_ids, weights, strict=True):
         if ids.shape[0] not in (1, levels):
             raise InputError(f"ensemble: a map of {ids.shape[0]} levels cannot be put together with one of {levels}")
         assert found.vectors is not None
         own = torch.cat([torch.zeros(1, found.channels), normalize(found.vectors, dim=1)]) * math.sqrt(weight)
         pairs, joint = (joint * len(own) + ids + 1).unique(return_inverse=True)
-        vectors = vectors[pairs // len(own)]
-        vectors[:, first : first + found.channels] = own[pairs % len(own)]
-        first += found.channels
+        vectors = torch.cat([vectors[pairs // len(own)], own[pairs % len(own)]], dim=1)
     known = vectors.any(dim=1)
     numbers = torch.where(known, known.cumsum(0) - 1, -1)
     return FeatureMap(space, ids=numbers[joint], vectors=vectors[known])

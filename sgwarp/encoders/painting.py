@@ -31,21 +31,21 @@ def cover_sets(masks: Tensor) -> tuple[Tensor, Tensor]:
     for number in range(count):
         inside = np.flatnonzero(flat[number])
         # Every set that the mask meets is split: the part inside becomes a new set with the mask added.
-        met, place = _met_sets(pixels[inside], len(members))
+        met, place = _met_sets(pixels[inside])
         pixels[inside] = len(members) + place
         for old in met:
             grown = members[old].copy()
             grown[number] = True
             members.append(grown)
-    used, place = _met_sets(pixels, len(members))
-    ids = place - (1 if len(used) and used[0] == 0 else 0)
+    used, place = _met_sets(pixels)
+    ids = place - int(0 in used)
     table = np.stack([members[k] for k in used if k != 0]) if (used != 0).any() else np.zeros((0, count), bool)
     return torch.from_numpy(ids.reshape(height, width)), torch.from_numpy(table)
 
 
-def _met_sets(sets: NDArray[np.int64], count: int) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+def _met_sets(sets: NDArray[np.int64]) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
     """The numbers that occur, ascending, and for each entry its place among them; without sorting the pixels."""
-    there = np.bincount(sets, minlength=count) > 0
+    there = np.bincount(sets) > 0
     return np.flatnonzero(there), (np.cumsum(there) - 1)[sets]
 
 

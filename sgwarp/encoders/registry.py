@@ -140,7 +140,7 @@ def encoder_of_questions(name: str, space: str, device: Device = "cpu") -> TextE
 
 def image_tower_for(space: str, device: Device = "cpu") -> Callable[[], ImageEncoder] | None:
     """What makes the encoder of images for a space whose text encoder takes none; None if there is none here."""
-    see = next((kind.see for kind in KINDS.values() if kind.see and kind.space == space), "")
+    see = next((kind.see for kind in KINDS.values() if kind.space == space), "")
     return (lambda: builder(see)(device=device)) if see else None
 
 

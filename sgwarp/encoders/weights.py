@@ -7,7 +7,6 @@ would want torchvision or Pillow for it.
 from __future__ import annotations
 
 import hashlib
-import json
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -20,6 +19,7 @@ from torch import Tensor, nn
 from torch.nn.functional import interpolate
 
 from sgwarp.errors import InputError
+from sgwarp.files.documents import read_json
 
 SAMPLE = 64  # numbers per tensor that tell one set of weights from another
 WAYS = {0: "nearest-exact", 2: "bilinear", 3: "bicubic"}  # Pillow's numbers
@@ -53,7 +53,7 @@ def load_config(path: str, what: str, types: tuple[str, ...]) -> Any:
     return config
 
 
-def load_model(name: str, path: str, what: str, device: str | torch.device, unneeded: tuple[str, ...] = ()) -> Any:
+def load_model(name: str, path: str, what: str, device: str | torch.device) -> Any:
     """A model of transformers with its weights, ready to be asked.
 
     Args:
@@ -61,7 +61,6 @@ def load_model(name: str, path: str, what: str, device: str | torch.device, unne
         path: Folder, or name on the hub.
         what: The encoder, for messages.
         device: Where it runs.
-        unneeded: Beginnings of parameter names that may be missing.
 
     Raises:
         InputError: The weights cannot be had, or some of them are missing and would be random.
@@ -69,7 +68,7 @@ def load_model(name: str, path: str, what: str, device: str | torch.device, unne
     transformers = require("transformers", "models", what)
     with _loading(path, what), no_progress_bar():
         model, info = getattr(transformers, name).from_pretrained(path, output_loading_info=True, dtype=torch.float32)
-    missing = sorted(key for key in info["missing_keys"] if not key.startswith(unneeded or ("\0",)))
+    missing = sorted(info["missing_keys"])
     wrong = sorted(str(key) for key in info.get("mismatched_keys", ()))
     if missing or wrong:
         listed = ", ".join((missing + wrong)[:3])
@@ -165,20 +164,20 @@ class Preparation:
                     path, name, _raise_exceptions_for_missing_entries=False, _raise_exceptions_for_gated_repo=False
                 )
             if found:
-                stored = json.loads(Path(found).read_text(encoding="utf-8"))
-                content = stored.get("image_processor", stored)
+                stored = read_json(found, f"fetch {what} again")
+                content = stored.get("image_processor", stored) if isinstance(stored, Mapping) else {}
             if "image_mean" in content:
                 break
         else:
             raise InputError(f"{what}: {path} holds no preprocessor_config.json, which says how to prepare images")
         size = content.get("size") or {}
         size = {"shortest_edge": size} if isinstance(size, int) else size
-        return cls(
-            tuple(content["image_mean"]),
-            tuple(content["image_std"]),
-            tuple(sorted((key, int(value)) for key, value in size.items() if value is not None)),
-            WAYS.get(content.get("resample", 3), "bicubic"),
-        )
+        try:
+            mean, deviation = (tuple(map(float, content[key])) for key in ("image_mean", "image_std"))
+            sides = tuple(sorted((key, int(value)) for key, value in size.items() if value is not None))
+        except (KeyError, TypeError, ValueError, AttributeError) as error:
+            raise InputError(f"{what}: {found} does not say how to prepare images ({error!r})") from None
+        return cls(mean, deviation, sides, WAYS.get(content.get("resample", 3), "bicubic"))
 
     @property
     def side(self) -> int | None:

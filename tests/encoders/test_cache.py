@@ -1,6 +1,7 @@
 """The disk cache: nothing is encoded twice, nothing wrong is ever given back."""
 
 import io
+import json
 import os
 import shutil
 import zipfile
@@ -164,13 +165,46 @@ def test_every_kind_of_map_survives(name):
             torch.testing.assert_close(mine.float(), theirs.float(), rtol=2**-11, atol=0)
 
 
-def test_maps_are_small_on_disk(tmp_path, view, image):
+def test_maps_are_small_on_disk(tmp_path, view):
+    image = torch.full((480, 640, 3), 0.5)
     CachedMaps(Source(), tmp_path).encode(view, image)
     (path,) = tmp_path.iterdir()
     with np.load(path) as stored:
         assert stored["ids"].dtype == np.int8
         assert stored["vectors"].dtype == np.float16
-    assert path.stat().st_size < image.nbytes
+    assert path.stat().st_size < 480 * 640 / 100
+
+
+def test_features_are_not_compressed(tmp_path, view, image):
+    """That would take longer than it saves."""
+    source = Source()
+    source.encode = lambda view, image: FeatureMap("toy-8", dense=torch.ones(48, 64, 8))
+    CachedMaps(source, tmp_path).encode(view, image)
+    (path,) = tmp_path.iterdir()
+    with zipfile.ZipFile(path) as archive:
+        assert {entry.compress_type for entry in archive.infolist()} == {zipfile.ZIP_STORED}
+        assert archive.getinfo("dense.npy").file_size < 1.1 * 48 * 64 * 8 * 2
+
+
+@pytest.mark.parametrize(
+    ("values", "kind"),
+    [
+        ([0.0, 0.0], "float16"),
+        ([0.0, 65504.0], "float16"),
+        ([0.0, -65504.0], "float16"),
+        ([2.0**-14, 0.0], "float16"),
+        ([65520.0, 1.0], "float32"),
+        ([2.0**-15, 0.0], "float32"),
+    ],
+)
+def test_half_precision_is_taken_where_it_keeps_the_numbers(values, kind):
+    assert pack(FeatureMap("s", dense=torch.tensor([[values]])))["dense"].dtype == kind
+
+
+def test_its_folder_is_made_with_all_above_it(tmp_path, view, image):
+    CachedMaps(Source(), tmp_path / "over" / "there").encode(view, image)
+    assert len(list((tmp_path / "over" / "there").iterdir())) == 1
+    CachedMaps(Source(), tmp_path / "over" / "there")
 
 
 def test_sources_without_a_key_are_always_asked(tmp_path, view, image):
@@ -204,12 +238,19 @@ def test_default_folder(monkeypatch, tmp_path):
     assert default_folder() == tmp_path / ".cache" / "sgwarp" / "maps"
     monkeypatch.setattr("sys.platform", "darwin")
     assert default_folder() == tmp_path / "Library" / "Caches" / "sgwarp" / "maps"
+    monkeypatch.setattr("sys.platform", "win32")
+    monkeypatch.delenv("LOCALAPPDATA", raising=False)
+    assert default_folder() == tmp_path / "AppData" / "Local" / "sgwarp" / "maps"
+    monkeypatch.setenv("LOCALAPPDATA", str(tmp_path / "local"))
+    assert default_folder() == tmp_path / "local" / "sgwarp" / "maps"
 
 
 def test_bad_places(tmp_path):
     (tmp_path / "file").touch()
     with pytest.raises(InputError, match=r"cannot be made .*; choose another, or none"):
         CachedMaps(Source(), tmp_path / "file" / "below")
+    with pytest.raises(InputError, match=r"cannot be made \(File exists\)"):
+        CachedMaps(Source(), tmp_path / "file")
     with pytest.raises(InputError, match="limit above 0"):
         CachedMaps(Source(), tmp_path, limit=0.0)
 
@@ -267,14 +308,28 @@ def test_the_entry_of_another_view_is_not_used(tmp_path):
 HEADER = b"\x93NUMPY\x01\x00\x3c\x00{'descr':'<f4','fortran_order':False,'shape':((((2,2,3)}     \n"
 
 
-@pytest.mark.parametrize("damage", ["folder", "header", "deep", "empty", "huge"])
+@pytest.mark.parametrize(
+    "damage", ["folder", "header", "deep", "empty", "huge", "list", "number", "no ids", "no such row", "no name"]
+)
 def test_a_damaged_entry_is_made_again(tmp_path, damage):
     source = Failing()
     view, image = two_views()[1], torch.zeros(12, 16, 3)
     CachedMaps(source, tmp_path).encode(view, image)
     (path,) = tmp_path.iterdir()
+    with np.load(path) as archive:
+        stored = dict(archive)
+    name = path.name.removesuffix(cache.SUFFIX)
     path.unlink()
-    if damage == "folder":
+    odd = {
+        "list": {**stored, "header": as_header([name])},
+        "number": {**stored, "header": as_header({"space": 3, "labels": None, "name": name})},
+        "no ids": {key: value for key, value in stored.items() if key != "ids"},
+        "no such row": {**stored, "ids": stored["ids"] + 2},
+        "no name": {**stored, "header": as_header({"space": "mine", "labels": None})},
+    }
+    if damage in odd:
+        np.savez(path, **odd[damage])
+    elif damage == "folder":
         (path / "below").mkdir(parents=True)
     elif damage == "empty":
         path.touch()
@@ -291,6 +346,10 @@ def test_a_damaged_entry_is_made_again(tmp_path, damage):
         assert int(CachedMaps(source, tmp_path).encode(view, image).ids.flatten()[0]) == 1
     assert source.asked == 2
     assert path.is_file()
+
+
+def as_header(content) -> np.ndarray:
+    return np.frombuffer(json.dumps(content).encode(), np.uint8)
 
 
 def numpy_bytes(text: bytes) -> bytes:
@@ -310,3 +369,15 @@ def test_the_limit_counts_what_others_write_and_removes_what_they_left(tmp_path)
         os.utime(path, (10**9 + number, 10**9 + number) if path != writing else None)
     shrink(tmp_path, 2500 / 1e9)
     assert {path.name for path in tmp_path.iterdir()} == {writing.name, new.name}
+
+
+def test_maps_that_somebody_else_removes_meanwhile_do_not_count(tmp_path):
+    """A link to nowhere is there when the folder is listed, and gone when its size is asked for."""
+    for number in range(12):
+        path = tmp_path / f"{number}.map.npz"
+        if number % 4 == 1:
+            path.write_bytes(bytes(100))
+        else:
+            path.symlink_to(tmp_path / "nowhere")
+    shrink(tmp_path, 1e-12)
+    assert not [path for path in tmp_path.iterdir() if not path.is_symlink()]

@@ -18,6 +18,7 @@ from sgwarp.scene import InstanceMap, Semantics
 from sgwarp.scene.instances import Instance
 
 NAMES = "abcdefgh"
+OTHERS = {"evidence": "cosine", "cosine": "relevancy", "relevancy": "cosine"}
 
 
 class Axes:
@@ -62,6 +63,24 @@ def test_scorings_are_those_of_the_guide():
     """docs/lift-and-ask.md names them, and how each says "none of these"."""
     assert (CONSE.scoring, CLIP.scoring, LSEG.scoring, PAPER.scoring) == ("evidence", "relevancy", "cosine", "cosine")
     assert (CONSE.least_deviation, CONSE.certain) == (0.02, 0.5)
+
+
+def test_an_ensemble_has_the_scoring_of_its_heaviest_member():
+    assert calibration_of_space("lseg-512-00aa@0.2 ++ clip-512-1f0c2d@0.8") is CLIP
+    assert calibration_of_space("lseg-512-00aa@0.8 ++ clip-512-1f0c2d@0.2") is LSEG
+    assert calibration_of_space("files:5@0.9 ++ clip-512-1f0c2d@0.1") is PAPER
+
+
+def test_temperatures():
+    """Of the paper, LERF (2023) and LSeg's training; that of the default encoder was chosen on one room."""
+    assert [one.temperature for one in (PAPER, CLIP, LSEG, CONSE)] == [0.1, 0.1, 0.07, 0.3]
+    others = {scoring: calibration_of(Axes(Calibration(other, 0.9)), scoring) for scoring, other in OTHERS.items()}
+    assert {scoring: (one.scoring, one.temperature) for scoring, one in others.items()} == {
+        "evidence": ("evidence", 0.3),
+        "cosine": ("cosine", 0.1),
+        "relevancy": ("relevancy", 0.1),
+    }
+    assert all((one.level, one.least_deviation, one.certain) == (1.0, 0.0, np.inf) for one in others.values())
 
 
 def test_an_encoder_may_state_its_own():

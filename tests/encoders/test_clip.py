@@ -8,6 +8,7 @@ import torch
 from torch.nn.functional import normalize
 
 from sgwarp.encoders.base import TextEncoder
+from sgwarp.encoders.images import clip
 from sgwarp.encoders.images.clip import JointEncoder
 from sgwarp.encoders.prompts import PLAIN
 from sgwarp.encoders.weights import Preparation, identity_of_weights, load_model
@@ -72,6 +73,27 @@ def test_texts(joint_models, kind):
         torch.testing.assert_close(vector, wanted, rtol=1e-4, atol=1e-5)
 
 
+def test_the_vectors_of_prompts_count_alike(joint_models):
+    """They are made unit vectors before they are averaged; the tokenizer is loaded once for all of them."""
+    encoder = JointEncoder(str(joint_models["clip"]), ("{}", "a photo of the semantic cup of a {}"))
+    loads = []
+    load = clip.load_tokenizer
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(clip, "load_tokenizer", lambda *given: loads.append(given) or load(*given))
+        found = torch.cat([encoder.encode_text(["couch"]), encoder.encode_text(["lamp"])])
+    assert len(loads) == 1
+    model = library_model(joint_models["clip"], "clip")
+    for vector, word in zip(found, (200, 201), strict=True):
+        parts = []
+        for row in ([101, word, 102], [101, 207, 208, 209, 203, 206, 202, 209, 207, word, 102]):
+            asked = {"input_ids": torch.tensor([row]), "attention_mask": torch.ones(1, len(row), dtype=torch.int64)}
+            with torch.no_grad():
+                parts.append(model.get_text_features(**asked).pooler_output[0])
+        assert (parts[0].norm() / parts[1].norm() - 1).abs() > 0.01  # else nothing would tell
+        wanted = normalize(sum(normalize(part, dim=0) for part in parts), dim=0)
+        torch.testing.assert_close(vector, wanted, rtol=1e-4, atol=1e-5)
+
+
 @pytest.mark.slow
 def test_dense_maps_have_the_shape_of_the_image(joint_models, kind, image):
     found = JointEncoder(str(joint_models[kind]), longest=64).encode_pixels(image)
@@ -114,6 +136,20 @@ def test_siglip_patches_are_pooled_alone(joint_models, siglip, image):
         for number in (0, 7, 15):
             wanted = normalize(vision.head(tokens[None, number : number + 1])[0], dim=0)
             torch.testing.assert_close(found[number], wanted, rtol=1e-3, atol=1e-5)
+
+
+def test_siglip2_is_given_patches_row_by_row(joint_models):
+    """As the library's processor lays them out: values of a patch, whether it is there, and the grid."""
+    encoder = JointEncoder(str(joint_models["siglip2"]))
+    images = torch.rand(2, 3, 16, 40, generator=torch.Generator().manual_seed(0))
+    found = encoder._inputs(images)
+    values = (images - torch.tensor([0.48, 0.45, 0.40])[:, None, None]) / torch.tensor([0.26, 0.25, 0.27])[
+        :, None, None
+    ]
+    assert found["pixel_values"].shape == (2, 2 * 5, 8 * 8 * 3)
+    torch.testing.assert_close(found["pixel_values"][1, 7], values[1, :, 8:16, 16:24].permute(1, 2, 0).flatten())
+    assert torch.equal(found["pixel_attention_mask"], torch.ones(2, 10, dtype=torch.int64))
+    assert found["spatial_shapes"].tolist() == [[2, 5]] * 2
 
 
 def test_space_is_that_of_the_weights_of_the_text_side(joint_models, tmp_path):

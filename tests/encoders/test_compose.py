@@ -37,6 +37,7 @@ class Toy:
         return normalize(torch.tensor([[text.count("a") + 0.5, len(text), 1.0] for text in texts]), dim=1)
 
     def find(self, view, image):
+        assert (view.stem, image.shape) == ("a", (HEIGHT, WIDTH, 3))
         boxes = torch.tensor([[4.0, 6, 30, 40], [20, 10, 60, 44], [0, 0, 64, 48]])
         return Instances(boxes, ("cat", "sofa", "banana"), torch.tensor([0.9, 0.5, 0.2]))
 
@@ -57,6 +58,7 @@ class Shapes:
         self.masks = Masks(masks, torch.ones(4), torch.tensor([2, 0, 0, 2]))
 
     def everything(self, view, image):
+        assert (view.stem, image.shape) == ("a", (HEIGHT, WIDTH, 3))
         return self.masks
 
     def in_boxes(self, image, boxes):
@@ -223,6 +225,8 @@ def test_instance_level(view, image, with_masks):
     generator = Shapes() if with_masks else None
     source = PaintedInstances(Toy(), Toy(), generator)
     found = source.encode(view, image)
+    assert found.size == (HEIGHT, WIDTH)
+    assert torch.equal(source.encode_text(["cat"]), Toy().encode_text(["cat"]))
     instances = Toy().find(view, image)
     vectors = Toy().encode_text(instances.names)
     for y in range(HEIGHT):
@@ -239,6 +243,17 @@ def test_instance_level(view, image, with_masks):
                 weights = instances.scores[covering]
                 wanted = (vectors[covering] * weights[:, None]).sum(dim=0) / weights.sum()
                 torch.testing.assert_close(at(found, y, x), wanted, rtol=1e-4, atol=1e-5)
+
+
+def test_a_box_holds_the_pixels_whose_centres_it_holds():
+    """Its near sides belong to it, its far sides do not."""
+    boxes = torch.tensor([[0.5, 1.5, 2.5, 3.5], [0.6, 1.6, 2.6, 3.6], [-9, -9, 99, 99], [2, 2, 2, 4]])
+    found = box_masks(boxes, (5, 4))
+    assert found.shape == (4, 5, 4)
+    assert found[0].nonzero().tolist() == [[1, 0], [1, 1], [2, 0], [2, 1]]
+    assert found[1].nonzero().tolist() == [[2, 1], [2, 2], [3, 1], [3, 2]]
+    assert found[2].all()
+    assert not found[3].any()
 
 
 def test_instances_with_masks_of_their_own(view, image):

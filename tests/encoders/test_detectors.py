@@ -1,5 +1,7 @@
 """GroundingDINO, OWLv2, CLIPSeg, Mask2Former and OneFormer on tiny networks of the real classes."""
 
+from types import SimpleNamespace
+
 import pytest
 import torch
 
@@ -120,6 +122,22 @@ def test_long_lists_of_names_are_asked_in_several_prompts(gdino, view, image):
         GroundingDino(str(gdino), ("couch " * 40,))
 
 
+def test_prompts_hold_the_names_in_their_order(gdino):
+    """Tokens and the class that each speaks for, -1 for marks and full stops, prompt by prompt."""
+    encoder = GroundingDino(str(gdino), ("couch", "teddy bear", " Lamp", "the cup", "photo"))
+    encoder.model.config.max_text_len = 10
+    pieces = [[200, 1012], [210, 211, 1012], [201, 1012], [203, 202, 1012], [208, 1012]]
+    wanted = [(0, pieces[:3], [-1, 0, -1, 1, 1, -1, 2, -1, -1]), (3, pieces[3:], [-1, 0, 0, -1, 1, -1, -1])]
+    found = list(encoder._fill_prompts("gdino"))
+    assert len(found) == len(wanted)
+    for (first, tokens, owners), (start, words, classes) in zip(found, wanted, strict=True):
+        ids = torch.tensor([[101, *(word for name in words for word in name), 102]])
+        assert (first, owners.tolist()) == (start, classes)
+        assert torch.equal(tokens["input_ids"], ids)
+        assert torch.equal(tokens["attention_mask"], torch.ones_like(ids))
+        assert torch.equal(tokens["token_type_ids"], torch.zeros_like(ids))
+
+
 @pytest.mark.parametrize(("positions", "longest", "limit"), [(12, 256, 12), (256, 12, 12), (256, 64, 64)])
 def test_a_prompt_keeps_to_the_shorter_of_two_limits(gdino, positions, longest, limit):
     encoder = GroundingDino(str(gdino), ("couch",) * 40)
@@ -159,6 +177,13 @@ def test_owlv2(owlv2, tools, view, image):
 def test_detectors_need_names(encoder):
     with pytest.raises(InputError, match="needs the names to look for"):
         encoder("somewhere", ())
+
+
+def test_owlv2_has_one_template(owlv2):
+    for templates in ((), ("{}", "the {}")):
+        with pytest.raises(InputError, match="needs the names to look for, and one template"):
+            Owlv2(str(owlv2), ("couch",), templates)
+    assert Owlv2(str(owlv2), ("couch " * 40,)).settings == DetectorSettings(0.1, 0.7)  # a long name is cut
 
 
 @pytest.mark.slow
@@ -219,6 +244,11 @@ def test_clipseg(clipseg, tools, image):
         answer = model(input_ids=tokens, attention_mask=(tokens > 0).long(), pixel_values=values.expand(2, -1, -1, -1))
     torch.testing.assert_close(found, answer.logits.sigmoid().permute(1, 2, 0), rtol=1e-3, atol=1e-5)
     assert not torch.allclose(found[..., 0], found[..., 1])
+    both = ClipSeg(str(clipseg), ("couch", "teddy bear"), ("{}", "a photo of a {}")).encode_pixels(image)
+    other = ClipSeg(str(clipseg), ("couch", "teddy bear"), ("a photo of a {}",)).encode_pixels(image)
+    torch.testing.assert_close(both, (found + other) / 2, rtol=1e-4, atol=1e-6)
+    long, cut = (ClipSeg(str(clipseg), ("couch " * count,)).encode_pixels(image) for count in (40, 14))
+    torch.testing.assert_close(long, cut, rtol=1e-4, atol=1e-6)  # 16 tokens with their marks
     with pytest.raises(InputError, match="needs the phrases to look for"):
         ClipSeg(str(clipseg), ())
 
@@ -274,11 +304,74 @@ def test_closed_sets(kind, tools, tmp_path, view, image):
     found = source.encode(view, image)
     assert (found.space, found.labels) == ("labels", ("couch", "lamp", "wall"))
     assert found.size == (16, 16)  # 48 x 64 becomes 64 x 64, read at a quarter
-    assert found.ids.min() >= 0
+    # What the library's own network is asked, by hand.
+    large = torch.nn.functional.interpolate(
+        image.permute(2, 0, 1)[None], (64, 64), mode="bicubic", antialias=True, align_corners=False
+    ).clamp(0, 1)
+    asked = {"pixel_values": (large - tools.mean[:, None, None]) / tools.deviation[:, None, None]}
+    if kind == "oneformer":
+        asked["task_inputs"] = torch.tensor([[101, 203, 204, 205, 206, 102] + [0] * 6])
+    with torch.no_grad():
+        answer = source.model(**asked)
+    best, number = class_shares(answer.class_queries_logits[0], answer.masks_queries_logits[0]).max(dim=0)
+    assert best.shape == (16, 16)  # as large as the map: nothing is resized
+    assert torch.equal(found.ids[0].long(), number)
+    middle = float(best.median())
+    some = ClosedSet(str(tmp_path), least=middle, longest=64).encode(view, image)
+    assert 0.3 < (some.ids >= 0).float().mean() < 0.7
+    clear = (best - middle).abs() > 1e-5
+    assert torch.equal((some.ids[0] >= 0)[clear], (best > middle)[clear])
     strict = ClosedSet(str(tmp_path), least=0.999, longest=64).encode(view, image)
     assert (strict.ids == -1).all()  # random weights are sure of nothing
     with pytest.raises(InputError, match="needs an image"):
         source.encode(view, None)
+
+
+def test_every_pixel_has_the_class_with_the_greatest_share(tools, tmp_path, view, image):
+    """Of a network that is sure of three regions, at half the size of the map; and of less than `least` nothing."""
+    write_closed_set(tmp_path, tools, "mask2former")
+    source = ClosedSet(str(tmp_path), least=0.6, longest=64)
+    classes = torch.full((1, 4, 4), -20.0)
+    for query, (number, logit) in enumerate([(0, 20.0), (2, 20.0), (1, 20.0), (0, -20.0)]):
+        classes[0, query, number] = logit  # all classes of the last alike, "nothing" among them
+    masks = torch.full((1, 4, 8, 8), -20.0)
+    masks[0, 0, :4] = masks[0, 1, 4:, :4] = masks[0, 3, 4:, 4:] = 20.0
+    masks[0, 2, :4, 6:] = 21.0
+    masks[0, 0, :4, 6:] = -1.0  # 0.27
+    asked = []
+
+    def model(**inputs):
+        asked.append(inputs)
+        return SimpleNamespace(class_queries_logits=classes, masks_queries_logits=masks)
+
+    source.model = model
+    found = source.encode(view, image).ids[0]
+    assert (asked[0]["pixel_mask"] == 1).all()
+    assert asked[0]["pixel_mask"].shape == (1, 64, 64)
+    assert found.shape == (16, 16)
+    assert (found[:7, :11] == 0).all()
+    assert (found[9:, :7] == 2).all()
+    assert (found[:7, 13:] == 1).all()
+    assert (found[9:, 9:] == -1).all()  # a quarter for each class
+
+
+@pytest.mark.parametrize(
+    ("settings", "fits"),
+    [
+        ({"least": 0.0, "longest": 32}, True),
+        ({"least": 0.99, "longest": 32}, True),
+        ({"least": 1.0}, False),
+        ({"least": -0.1}, False),
+        ({"longest": 31}, False),
+    ],
+)
+def test_settings_of_closed_sets(tools, tmp_path, settings, fits):
+    write_closed_set(tmp_path, tools, "mask2former")
+    if fits:
+        assert ClosedSet(str(tmp_path), **settings).longest == 32
+        return
+    with pytest.raises(InputError, match="least is a confidence from 0 to 1 and longest at least 32"):
+        ClosedSet(str(tmp_path), **settings)
 
 
 def test_class_shares_against_a_loop():

@@ -2,7 +2,7 @@
 
 import pytest
 import torch
-from torch.nn.functional import normalize
+from torch.nn.functional import interpolate, normalize
 
 from sgwarp.encoders.ensemble import Ensemble, TextEnsemble, join_maps
 from sgwarp.errors import InputError
@@ -142,3 +142,50 @@ def test_what_does_not_go_together(pair, view, image):
 
 def test_text_side_alone_has_the_same_space(pair):
     assert TextEnsemble(pair, (3.0, 1.0)).space == Ensemble(pair, (3.0, 1.0)).space
+
+
+def test_dense_maps_of_two_sizes():
+    """The coarser one is read bilinearly at the size of the finer, as directions; both orders give the same."""
+    fine, coarse = unit(12, 16, 3, seed=1), 7 * unit(6, 8, 4, seed=2)
+    large = interpolate(normalize(coarse, dim=2).permute(2, 0, 1)[None], (12, 16), mode="bilinear")[0]
+    parts = [fine * 0.8**0.5, normalize(large.permute(1, 2, 0), dim=2) * 0.2**0.5]
+    maps = [FeatureMap("one", dense=fine), FeatureMap("two", dense=coarse.half())]
+    for order in ((0, 1), (1, 0)):
+        found = join_maps("both", [maps[k] for k in order], [(0.8, 0.2)[k] for k in order])
+        wanted = torch.cat([parts[k] for k in order], dim=2)
+        torch.testing.assert_close(found.dense, wanted, rtol=1e-3, atol=1e-3)  # half precision of the second
+        assert found.valid is None
+
+
+@pytest.mark.parametrize("kind", ["ids", "dense"])
+@pytest.mark.parametrize("order", [1, -1])
+def test_the_map_with_the_most_pixels_gives_the_size(kind, order):
+    """Not the one with the most rows."""
+    maps = []
+    for size in ((4, 40), (5, 8))[::order]:
+        parts = {"ids": ids(size, 3, 0), "vectors": unit(3, 4)} if kind == "ids" else {"dense": unit(*size, 4)}
+        maps.append(FeatureMap("one", **parts))
+    assert join_maps("both", maps, (0.5, 0.5)).size == (4, 40)
+
+
+@pytest.mark.parametrize("needed", [(True, True), (True, False), (False, True), (False, False)])
+def test_the_photograph_is_needed_if_a_member_needs_it(pair, needed):
+    for member, needs in zip(pair, needed, strict=True):
+        member.needs_image = needs
+    assert Ensemble(pair, (1.0, 1.0)).needs_image == any(needed)
+
+
+def test_every_map_has_its_weight(pair):
+    maps = [member.found for member in pair]
+    dense = FeatureMap("three", dense=torch.ones(6, 8, 2))
+    for several in (maps, [*maps, dense]):
+        with pytest.raises(ValueError, match="shorter"):
+            join_maps("both", several, [0.5])
+
+
+def test_the_members_are_given_view_and_photograph(pair, view, image):
+    asked = []
+    for member in pair:
+        member.encode = lambda *given, member=member: asked.append(given) or member.found
+    Ensemble(pair, (1.0, 1.0)).encode(view, image)
+    assert [(one is view, other is image) for one, other in asked] == [(True, True)] * 2

@@ -1,4 +1,4 @@
-"""What other programs export: VLPart's instances, DEVA's ids, masks, Feature 3DGS's maps; written here by hand."""
+"""What other programs export: VLPart's instances, masks, Feature 3DGS's maps; written here by hand."""
 
 import json
 
@@ -9,7 +9,6 @@ import torch
 
 from sgwarp.encoders.base import UNRANKED, MissingMap
 from sgwarp.encoders.instances.vlpart import VLPartFiles, decode_rle, plain_name
-from sgwarp.encoders.maps.deva import DevaMaps
 from sgwarp.encoders.maps.files import FileMaps
 from sgwarp.encoders.masks.files import FileMasks
 from sgwarp.errors import InputError
@@ -57,6 +56,63 @@ def test_run_lengths_of_random_masks():
     for _ in range(20):
         mask = rng.random((rng.integers(1, 40), rng.integers(1, 40))) < rng.random()
         np.testing.assert_array_equal(decode_rle({"size": mask.shape, "counts": as_text(runs(mask))}), mask)
+
+
+@pytest.mark.parametrize(
+    ("size", "counts", "message"),
+    [
+        ([0, 5], [], "a mask of 0 x 5 pixels"),
+        ([5, 0], [0], "a mask of 5 x 0 pixels"),
+        ([-2, -3], [6], "a mask of -2 x -3 pixels"),
+        ([10**6, 10**6], [4], "a mask of 1000000 x 1000000 pixels"),
+        ([2, 2], [], "run lengths add up to 0, not 2 x 2"),
+        ([2, 2], [5, -2, 1], "run lengths add up to 4, not 2 x 2"),
+        ([2, 2], [5], "run lengths add up to 5"),
+        ([2, 2], "/", "stands for no run length"),
+        ([2, 2], "p", "stands for no run length"),
+        ([2, 2], "\x94", "stands for no run length"),
+    ],
+)
+def test_run_lengths_of_no_mask(size, counts, message):
+    with pytest.raises(ValueError, match=message):
+        decode_rle({"size": size, "counts": counts})
+
+
+def test_the_last_character_of_all_goes_on():
+    """Six bits set: a run that never ends."""
+    with pytest.raises(IndexError):
+        decode_rle({"size": [2, 2], "counts": "o"})
+
+
+@pytest.mark.parametrize(("rows", "fits"), [(25, True), (23, True), (26, False), (22, False)])
+def test_masks_may_be_off_by_a_pixel(tmp_path, view, image, rows, fits):
+    """Of an image of 64 x 48, 32 x 24 pixels are expected: sizes are rounded."""
+    masks = np.ones((1, rows, 32), bool)
+    for folder in ("found", "masks"):
+        (tmp_path / folder).mkdir()
+    np.savez(tmp_path / "masks" / "a.npz", masks=masks)
+    np.savez(tmp_path / "found" / "a.npz", masks=masks, boxes=[[0.0, 0, 5, 5]], names=np.array(["x"]), scores=[1.0])
+    instances, generator = VLPartFiles(tmp_path / "found"), FileMasks(tmp_path / "masks")
+    for read in (lambda: instances.find(view, image), lambda: generator.everything(view, image)):
+        if fits:
+            assert read().masks.shape == (1, rows, 32)
+        else:
+            with pytest.raises(InputError, match=f"32 x {rows}, not the shape of view a"):
+                read()
+
+
+def test_masks_of_instances_have_three_axes(tmp_path, view, image):
+    arrays = {"boxes": [[0.0, 0, 5, 5]], "names": np.array(["x"]), "scores": [1.0]}
+    np.savez(tmp_path / "a.npz", masks=np.ones((1, 48), bool), **arrays)
+    with pytest.raises(InputError, match=r"a\.npz: expected masks \[K, h, w\], got \[1, 48\]"):
+        VLPartFiles(tmp_path).find(view, image)
+
+
+@pytest.mark.parametrize("suffix", [".json", ".npz"])
+def test_a_file_of_either_kind_is_enough(tmp_path, view, suffix):
+    assert not VLPartFiles(tmp_path).has_map(view)
+    (tmp_path / f"a{suffix}").touch()
+    assert VLPartFiles(tmp_path).has_map(view)
 
 
 ROWS = [
@@ -202,67 +258,6 @@ def test_names_as_one_says_them():
     assert plain_name("office_chair:left_arm") == "office chair left arm"
 
 
-@pytest.fixture
-def deva(tmp_path):
-    """Two frames of a video with long ids; a third view has none."""
-    pictures = tmp_path / "Annotations"
-    pictures.mkdir()
-    ids = np.zeros((48, 64), np.int64)
-    ids[5:20, 5:20], ids[25:40, 30:60] = 70000, 513
-    frames = []
-    for stem in ("a", "b"):
-        shown = ids if stem == "a" else np.where(ids == 513, 0, ids)
-        cv2.imwrite(
-            str(pictures / f"{stem}.png"), np.stack([shown >> 16, shown >> 8 & 255, shown & 255], -1).astype(np.uint8)
-        )
-        segments = [{"id": int(k), "category_id": 1, "score": 0.9 if k == 513 else 0.4} for k in np.unique(shown) if k]
-        frames.append({"file_name": f"{stem}.jpg", "segments_info": segments})
-    (tmp_path / "pred.json").write_text(json.dumps({"annotations": frames}))
-    return tmp_path, ids
-
-
-def test_deva(deva, tools):
-    folder, ids = deva
-    views = [tools.make_view(stem=stem) for stem in "abc"]
-    source = DevaMaps(folder, views)
-    found = source.encode(views[0])
-    assert (found.space, found.labels) == ("labels", ("513", "70000"))
-    wanted = np.select([ids == 513, ids == 70000], [0, 1], -1)
-    np.testing.assert_array_equal(found.ids[0], wanted)
-    assert source.encode(views[1]).ids.unique().tolist() == [-1, 1]
-    assert not source.has_map(views[2])
-    sure = DevaMaps(folder, views, least_score=0.5).encode(views[0])
-    np.testing.assert_array_equal(sure.ids[0], np.where(wanted == 1, -1, wanted))
-
-
-def test_deva_with_a_folder_per_video(deva, tools):
-    folder, _ = deva
-    inner = folder / "Annotations" / "video"
-    inner.mkdir()
-    for path in (folder / "Annotations").glob("*.png"):
-        path.rename(inner / path.name)
-    view = tools.make_view()
-    assert DevaMaps(folder, [view]).encode(view).ids.unique().tolist() == [-1, 0, 1]
-
-
-def test_deva_says_what_does_not_fit(deva, tools, tmp_path_factory):
-    folder, _ = deva
-    view = tools.make_view()
-    content = json.loads((folder / "pred.json").read_text())
-    content["annotations"][0]["segments_info"].pop()
-    (folder / "pred.json").write_text(json.dumps(content))
-    with pytest.raises(InputError, match=r"pred\.json: lists no segment \d+ in frame a, which shows it"):
-        DevaMaps(folder, [view]).encode(view)
-    (folder / "pred.json").write_text(json.dumps({"annotations": []}))
-    with pytest.raises(InputError, match=r"pred\.json: lists no frame a"):
-        DevaMaps(folder, [view]).encode(view)
-    (folder / "pred.json").write_text("{}")
-    with pytest.raises(InputError, match=r"is not the pred\.json of DEVA"):
-        DevaMaps(folder, [view])
-    with pytest.raises(InputError, match="has no folder Annotations"):
-        DevaMaps(tmp_path_factory.mktemp("empty"), [view])
-
-
 def test_masks_of_label_images(tmp_path, view, image):
     ids = np.zeros((24, 32), np.uint8)
     ids[2:8, 3:9], ids[10:20, 10:30] = 7, 3
@@ -270,6 +265,7 @@ def test_masks_of_label_images(tmp_path, view, image):
     found = FileMasks(tmp_path).everything(view, image)
     np.testing.assert_array_equal(found.masks, np.stack([ids == 3, ids == 7]))
     assert found.ranks.tolist() == [UNRANKED] * 2
+    assert found.scores.tolist() == [1.0, 1.0]
 
 
 def test_stacks_of_masks(tmp_path, view, image):
@@ -310,8 +306,8 @@ def test_missing_masks(tmp_path, view, image):
 
 def test_feature_3dgs(tmp_path, tools):
     view = tools.make_view(40, 40)
-    features = torch.randn(6, 20, 20).half()
+    features = torch.randn(20, 20, 20).half()
     torch.save(features, tmp_path / "a_fmap_CxHxW.pt")
     source = FileMaps(tmp_path, [view])
     assert torch.equal(source.encode(view).dense, features.permute(1, 2, 0))  # square: only the name tells the layout
-    assert source.space == "files:6"
+    assert source.space == "files:20"

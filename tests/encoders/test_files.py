@@ -141,7 +141,7 @@ def test_the_folder_names_the_space(tmp_path):
     assert FileMaps(tmp_path, VIEWS).encode(view()).space == "clip-vit-b32-512"
 
 
-@pytest.mark.parametrize("text", ["{", "[1]", '{"space": ""}', '{"name": "x"}'])
+@pytest.mark.parametrize("text", ["{", "[1]", '{"space": 5}', '{"space": ""}', '{"name": "x"}'])
 def test_bad_space_file(tmp_path, text):
     np.save(tmp_path / "a.npy", features())
     (tmp_path / "meta.json").write_text(text)
@@ -186,6 +186,26 @@ def test_langsplat_ids_must_have_vectors(pair):
 def test_level_out_of_range(pair):
     with pytest.raises(InputError, match=r"has no level 4; its levels are 0 to 3"):
         FileMaps(pair[0], VIEWS, levels=[1, 4])
+    with pytest.raises(InputError, match=r"has no level -1; its levels are 0 to 3"):
+        FileMaps(pair[0], VIEWS, levels=[-1])
+    assert FileMaps(pair[0], VIEWS, levels=[0, 3]).encode(view()).ids.tolist() == pair[1][[0, 3]].tolist()
+
+
+@pytest.mark.parametrize(
+    ("name", "array", "message"),
+    [
+        ("a_s", np.zeros((2, WIDTH, HEIGHT)), r"a_s\.npy: is 48 x 64, not the shape of view a"),
+        ("a_s", np.zeros((HEIGHT, WIDTH)), r"a_s\.npy: expected integer ids"),
+        ("a_s", np.zeros((0, HEIGHT, WIDTH)), r"a_s\.npy: expected integer ids"),
+        ("a_s", np.zeros((2, HEIGHT, WIDTH), complex), r"a_s\.npy: expected integer ids"),
+        ("a_f", np.zeros((6, 8), np.int64), r"a_f\.npy: expected floating point \[M, C\], got int64"),
+        ("a_f", np.zeros((6, 8, 1)), r"a_f\.npy: expected floating point \[M, C\]"),
+    ],
+)
+def test_pairs_that_are_none(pair, name, array, message):
+    np.save(pair[0] / f"{name}.npy", array)
+    with pytest.raises(InputError, match=message):
+        FileMaps(pair[0], VIEWS)
 
 
 @pytest.mark.parametrize("suffix", [".npy", ".npz", ".pt", ".safetensors"])
@@ -228,6 +248,13 @@ def test_arrays_that_are_no_features(tmp_path, content, message):
         FileMaps(tmp_path, VIEWS)
 
 
+@pytest.mark.parametrize("name", ["features", "feat", "dense", "arr_0"])
+def test_features_beside_other_arrays(tmp_path, name):
+    values = features()
+    np.savez(tmp_path / "a.npz", **{"scale": np.ones(3), name: values, "other": features(7)})
+    assert FileMaps(tmp_path, VIEWS).encode(view()).dense.tolist() == values.tolist()
+
+
 def test_several_arrays_without_a_known_name(tmp_path):
     np.savez(tmp_path / "a.npz", one=features(), two=features())
     with pytest.raises(InputError, match=r"a\.npz: holds one, two; store one array, or name it 'features'"):
@@ -267,6 +294,20 @@ def test_label_that_came_later(labels):
     cv2.imwrite(str(folder / "a.png"), np.full((HEIGHT, WIDTH), 5, np.uint8))
     with pytest.raises(InputError, match=r"a\.png: id 5 was not there"):
         source.encode(view())
+    ids = np.full((HEIGHT, WIDTH), 7, np.uint16)
+    ids[5, 6] = 60000  # beyond all that were there
+    cv2.imwrite(str(folder / "a.png"), ids)
+    with pytest.raises(InputError, match=r"a\.png: id 60000 was not there"):
+        source.encode(view())
+
+
+def test_a_kind_that_came_later(labels):
+    folder, _ = labels
+    source = FileMaps(folder, VIEWS)
+    assert [source.has_map(one) for one in VIEWS] == [True, True, False]
+    np.save(folder / "c.npy", features())
+    with pytest.raises(InputError, match=r"c\.npy: holds dense, the maps before it labels"):
+        FileMaps(folder, VIEWS[:2]).encode(VIEWS[2])
 
 
 @pytest.mark.parametrize(

@@ -6,6 +6,7 @@ import pytest
 import torch
 from torch.nn.functional import normalize
 
+from sgwarp.encoders.pixels import lseg
 from sgwarp.encoders.pixels.lseg import LSeg, clip_text_tower
 from sgwarp.encoders.pixels.lseg_network import Fusion, LSegNetwork, LSegShape
 from sgwarp.errors import InputError
@@ -176,6 +177,16 @@ def test_transformer_against_plain_formulas(checkpoint, weights):
     torch.testing.assert_close(maps[2][0], wanted, rtol=1e-9, atol=1e-9)
 
 
+@pytest.mark.parametrize(
+    "shape",
+    [LSegShape(), LSegShape(64, 4, 1, 8, 2, (4, 5, 6, 7), 3, 9), LSegShape(32, 8, 1, 4, 5, (1, 2, 3, 4), 6, 5)],
+)
+def test_sizes_are_read_off_the_parameters(shape):
+    with torch.device("meta"):
+        network = LSegNetwork(shape)
+    assert LSegShape.of(network.state_dict()) == shape
+
+
 def test_fusion_against_plain_formulas():
     torch.manual_seed(0)
     fusion = Fusion(3).double().eval()
@@ -217,6 +228,24 @@ def test_pixels(checkpoint, image):
     with torch.no_grad():
         wanted = encoder.network((large - 0.5) / 0.5)[0]
     torch.testing.assert_close(found, normalize(wanted, dim=0).permute(1, 2, 0), rtol=1e-4, atol=1e-5)
+
+
+def test_the_network_sees_two_patches_at_least(checkpoint):
+    assert LSeg(str(checkpoint), tokenizer="nowhere", longest=2 * PATCH).longest == 2 * PATCH
+    with pytest.raises(InputError, match=r"longest side 31 is less than 32 pixels"):
+        LSeg(str(checkpoint), tokenizer="nowhere", longest=2 * PATCH - 1)
+
+
+def test_its_text_side_is_loaded_once_and_cuts_long_phrases(checkpoint, tokenizer, monkeypatch):
+    loads = []
+    load = lseg.load_tokenizer
+    monkeypatch.setattr(lseg, "load_tokenizer", lambda *given: loads.append(given) or load(*given))
+    encoder = LSeg(str(checkpoint), tokenizer=tokenizer)
+    assert not loads
+    long, cut = (encoder.encode_text(["couch " * count]) for count in (40, LENGTH - 2))
+    torch.testing.assert_close(long, cut)
+    torch.testing.assert_close(long.norm(dim=1), torch.ones(1))
+    assert [given[0] for given in loads] == [tokenizer]
 
 
 def test_phrases_by_the_checkpoints_own_text_tower(checkpoint, weights, tokenizer):

@@ -231,11 +231,29 @@ def made(monkeypatch):
     return build
 
 
+@pytest.mark.parametrize("given", ["", "?background=yes", "?background=no"])
+def test_what_surrounds_a_mask_stays_visible_unless_told_otherwise(made, given):
+    source = made("images.clip.JointEncoder", f"clip:P+graph{given}").source
+    assert source.encoder.background == (given != "?background=no")
+    assert source.levels == ("default",)
+
+
+def test_without_masks_a_network_of_pixels_stands_alone(made):
+    assert isinstance(made("images.clip.JointEncoder", "clip:P?rule=pixels").source, PlainPixels)
+    refined = made("images.clip.JointEncoder", "clip:P?rule=pixels+slic").source
+    assert (type(refined), refined.generator.method, refined.rest) == (RefinedPixels, "slic", "cells")
+
+
 def test_options_reach_the_networks(made):
     assert made("images.clip.JointEncoder", "clip:P?longest=448").longest == 448
     assert not hasattr(made("images.clip.JointEncoder", "clip:P"), "longest")
     call = made("pixels.lseg.LSeg", "lseg:P?longest=300&tokenizer=T")
     assert (call.longest, call.tokenizer) == (300, "T")
+    for given, pooled in (("", True), ("?pooled=yes", True), ("?pooled=no", False)):
+        call = made("pixels.openseg.OpenSeg", f"openseg:P{given}+text:conse")
+        assert (call.arguments[0], call.arguments[1].space, call.arguments[2]) == ("P", KINDS["conse"].space, pooled)
+    call = made("pixels.clipseg.ClipSeg", "clipseg:P?classes=a,b")
+    assert call.arguments == ("P", ("a", "b"))
     call = made("maps.closed_set.ClosedSet", "mask2former:P?least=0.7&longest=320")
     assert (call.arguments, call.least, call.longest) == (("P",), 0.7, 320)
 

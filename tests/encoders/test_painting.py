@@ -100,6 +100,8 @@ def test_resize_masks():
     assert torch.equal(resize_masks(masks, (9, 13)), masks)
     double = resize_masks(masks, (18, 26))
     assert torch.equal(double, masks.repeat_interleave(2, dim=1).repeat_interleave(2, dim=2))
+    thirds = resize_masks(masks[:, :, :12], (3, 4))
+    assert torch.equal(thirds, masks[:, 1::3, 1:12:3])  # a third has its middle pixel
 
 
 def test_vectors_come_back_normalised_from_single_masks():

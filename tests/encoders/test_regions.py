@@ -145,6 +145,7 @@ def test_scales_become_ranks():
     assert counts[0] > counts[1] > counts[2] > 0
     for rank in range(3):  # each scale is a partition
         assert (found.masks[found.ranks == rank].sum(dim=0) == 1).all()
+    assert found.masks.flatten(1).any(dim=1).all()
     assert found.at_level("default").tolist() == list(range(len(found)))
     assert found.at_level("l").tolist() == (found.ranks == 2).nonzero().flatten().tolist()
     with pytest.raises(InputError, match="level 'xl' is not one of default, s, m, l"):
@@ -162,7 +163,9 @@ def test_proposals_have_no_boxes():
         Proposals().in_boxes(torch.zeros(8, 8, 3), torch.zeros(1, 4))
 
 
-@pytest.mark.parametrize("settings", [{"scales": (0.0,)}, {"side": 2}, {"smallest": 0}, {"method": "sam"}])
+@pytest.mark.parametrize(
+    "settings", [{"scales": (0.0,)}, {"scales": (9.0, 0.0)}, {"side": 2}, {"smallest": 0}, {"method": "sam"}]
+)
 def test_bad_proposals(settings):
     with pytest.raises(InputError, match="proposals"):
         Proposals(**settings)

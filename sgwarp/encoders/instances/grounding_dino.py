@@ -52,7 +52,7 @@ class GroundingDino:
             raise InputError(f"{what}: needs the names to look for: gdino:{path}?classes=couch,lamp")
         load_config(path, what, ("grounding-dino",))
         self.classes = tuple(classes)
-        self.settings = settings or DetectorSettings(least_score=0.25)
+        self.settings = settings or DetectorSettings(LEAST_SCORE)
         self.device = torch.device(device)
         self.model = load_model("GroundingDinoForObjectDetection", path, what, device)
         self.preparation = Preparation.load(path, what)

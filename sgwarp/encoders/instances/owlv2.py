@@ -55,7 +55,7 @@ class Owlv2:
             raise InputError(f"{what}: needs the names to look for, and one template: owlv2:{path}?classes=couch,lamp")
         load_config(path, what, ("owlv2",))
         self.classes = tuple(classes)
-        self.settings = settings or DetectorSettings(least_score=0.1)
+        self.settings = settings or DetectorSettings(LEAST_SCORE)
         self.device = torch.device(device)
         self.model = load_model("Owlv2ForObjectDetection", path, what, device)
         self.preparation = Preparation.load(path, what)

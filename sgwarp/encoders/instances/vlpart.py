@@ -118,6 +118,8 @@ def _read_npz(path: Path) -> Instances:
     except (ValueError, TypeError, RuntimeError, OverflowError) as error:
         raise InputError(f"{path}: boxes [K, 4] and scores [K] must be numbers ({error})") from None
     masks = torch.from_numpy(arrays["masks"].astype(bool)) if "masks" in arrays else None
+    if masks is not None and masks.ndim != 3:
+        raise InputError(f"{path}: expected masks [K, h, w], got {list(masks.shape)}")
     try:
         names = [str(name) for name in arrays["names"]]
     except (ValueError, TypeError):
@@ -150,7 +152,7 @@ def decode_rle(mask: Mapping[str, Any]) -> NDArray[np.bool_]:
         raise ValueError(f"a mask of {height} x {width} pixels")
     counts = mask["counts"]
     runs = _decode_counts(counts) if isinstance(counts, str) else [int(count) for count in counts]
-    if sum(runs) != height * width or min(runs, default=0) < 0:
+    if sum(runs) != height * width or min(runs) < 0:
         raise ValueError(f"run lengths add up to {sum(runs)}, not {height} x {width}")
     values = np.repeat(np.arange(len(runs)) % 2 == 1, runs)
     return np.ascontiguousarray(values.reshape(width, height).T)

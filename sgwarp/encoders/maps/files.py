@@ -159,17 +159,18 @@ class FileMaps:
         layout = "chw" if path.name.endswith(CHANNELS_FIRST) else self.layout
         if self.straight or view.undistort is None:
             return channels_last(path, features, view.camera.size, layout), valid
-        dense = channels_last(path, features, self._stored_size(view, features), layout)
+        dense = channels_last(path, features, self._stored_size(view, features, layout), layout)
         smooth = self._carried(path, dense.to(torch.float32).numpy(), view, nearest=False)
         known = None if valid is None else torch.from_numpy(self._carried(path, valid.numpy(), view))
         return torch.from_numpy(np.ascontiguousarray(smooth)).to(dense.dtype), known
 
-    def _stored_size(self, view: View, features: Tensor) -> tuple[int, int]:
+    def _stored_size(self, view: View, features: Tensor, layout: Layout | None) -> tuple[int, int]:
         """(height, width) of the photograph as stored, or lying as the features do."""
         height, width = view.camera.size
-        shape = tuple(features.shape)
-        stands = same_shape(shape[1:], (height, width)) or same_shape(shape[:2], (height, width))
-        return (height, width) if stands else (width, height)
+        a, b, c = features.shape
+        shapes = {"chw": (b, c), "hwc": (a, b)}
+        asked = shapes.values() if layout is None else [shapes[layout]]
+        return (height, width) if any(same_shape(shape, (height, width)) for shape in asked) else (width, height)
 
     def _carried(self, path: Path, array: Any, view: View, nearest: bool = True) -> Any:
         """What belongs to the photograph as stored, as it belongs to the image of the view's camera."""

@@ -104,11 +104,8 @@ class Conse:
         cell = self.settings.dense_cell * max(pixels.shape[:2]) / self.settings.side
         height, width = (max(1, round(side / cell)) for side in pixels.shape[:2])
         maps = [self.classifier.logit_map(pixels, side) for side in self.settings.map_sides]
-        total = torch.zeros(height, width, maps[0].logits.shape[-1])
-        for found in maps:
-            rows, columns = found.interpolation(height, width)
-            total += torch.einsum("yi,xj,ijk->yxk", rows, columns, found.logits)
-        return _place(total / len(maps))
+        read = [torch.einsum("yi,xj,ijk->yxk", *found.interpolation(height, width), found.logits) for found in maps]
+        return _place(torch.stack(read).mean(dim=0))
 
     def encode_regions(self, image: Tensor, masks: Tensor) -> Tensor:
         """Unit vectors, float32 [M, 512], of masks, bool [M, h, w] and none of them empty, of an image [H, W, 3]."""
