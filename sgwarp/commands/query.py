@@ -47,7 +47,7 @@ class Query(SemanticsOptions):
     """What the text has to beat with --score relevancy."""
 
     threshold: float = 0.5
-    """Least score of a pixel of the mask, where 0 is the scene's median score and 1 its best thousandth."""
+    """Pixels of the mask score more than this, where 0 is the scene's median score and 1 its best thousandth."""
 
     box: int = 9
     """Side of the box over which scores are averaged before the best pixel is taken [pixels]."""

@@ -76,6 +76,7 @@ def test_options_that_do_not_fit_are_named_in_one_short_line():
     text = str(refused.value)
     assert text.startswith("lift: its options do not fit: ")
     assert "  " not in text
+    assert text == text.strip()
     assert "\n" not in text
     assert "│" not in text
     assert 60 < len(text) <= 330
