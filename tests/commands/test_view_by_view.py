@@ -111,6 +111,23 @@ def test_the_colors_of_a_heat_map_mean_the_same_in_every_query(asked, stage_file
     assert np.abs(found - stretched)[far].max() > 20
 
 
+@pytest.mark.parametrize("name", ["q.png", "other.png"])
+def test_a_photograph_is_kept_before_the_work(stage_files, labels, tmp_path, monkeypatch, capsys, name):
+    """Whether the mask or its heat map would take its place, and whichever view it belongs to."""
+    views = tmp_path / "views"
+    (views / "images").mkdir(parents=True)
+    data = json.loads((stage_files.views / "transforms.json").read_text())
+    data["frames"][4]["file_path"] = "images/q.png"
+    data["frames"][5]["file_path"] = "images/other_heat.png"
+    (views / "transforms.json").write_text(json.dumps(data))
+    for frame, stem in zip(data["frames"], STEMS, strict=True):
+        (views / frame["file_path"]).write_bytes((stage_files.views / "images" / f"{stem}.png").read_bytes())
+    monkeypatch.setattr("sgwarp.querying.segmentation.localize", None)
+    words = ["query", stage_files.scene, "--views", views, "--view", "0001", "--text", "1", "--semantics", labels]
+    assert run(*words, "--out", views / "images" / name) == 2
+    assert "is read by this command" in capsys.readouterr().err
+
+
 # convert
 
 
