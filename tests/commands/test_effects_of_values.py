@@ -20,11 +20,14 @@ def make(name: str, **options):
     ("out", "plain", "version"),
     [
         ("o.ply", True, False),
-        ("o.compressed.ply", False, False),
         ("O.PLY", True, False),
+        ("o.compressed.ply", False, False),
         ("o.COMPRESSED.ply", False, False),
-    ]
-    + [("o.spz", False, True), ("o.SPZ", False, True), ("o.splat", False, False), ("ply", False, False)],
+        ("o.spz", False, True),
+        ("o.SPZ", False, True),
+        ("o.splat", False, False),
+        ("ply", False, False),
+    ],
 )
 def test_columns_are_left_out_of_plain_ply_files_alone(out, plain, version):
     command = make("convert", out=Path(out))
