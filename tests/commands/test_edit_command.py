@@ -14,7 +14,10 @@ from sgwarp.commands.edit import Edit
 from sgwarp.errors import InputError
 from sgwarp.files.images import read_rgb
 from sgwarp.io.scenes import load_gaussians, save_gaussians
+from sgwarp.io.store import save_semantics
+from sgwarp.lifting.lifter import lift
 from sgwarp.rendering.renderer import render
+from sgwarp.runs.log import RunLog
 from sgwarp.scene import Gaussians
 
 
@@ -147,6 +150,23 @@ def test_the_view_is_drawn_before_and_after(stage, stage_files, tmp_path):
     assert log["outputs"][2:] == [str(tmp_path / "e.png")]
     assert log["stages"]["draw"] > 0
     assert run(*words, "--views", stage_files.views, "--view", "0009") == 2
+
+
+def test_labels_need_no_encoder_and_all_else_has_that_of_its_lift(stage, stage_files, toy_text, tmp_path, monkeypatch):
+    asked = []
+    monkeypatch.setattr("sgwarp.encoders.registry.text_encoder_for", lambda *given: asked.append(given) or toy_text)
+    for name, maps in (("labels", stage.one_hot), ("features", stage.dense)):
+        path = tmp_path / f"{name}.safetensors"
+        save_semantics(lift(stage_files.gaussians, stage.views[:1], maps), path, {"encoder": "clip:first"})
+        edit = Edit(scene=stage_files.scene, out=tmp_path / "o.ply", semantics=path)
+        context = edit._context(stage_files.gaussians, RunLog())
+        assert context.semantics.space == ("labels" if name == "labels" else "toy")
+        assert context.encoder is (None if name == "labels" else toy_text)
+        assert (context.instances, context.views) == (None, ())
+    assert asked == [("toy", "clip:first", "cpu")]
+    edit.encoder = "clip:other"
+    edit._context(stage_files.gaussians, RunLog())
+    assert asked[1:] == [("toy", "clip:other", "cpu")]
 
 
 @pytest.mark.parametrize(
