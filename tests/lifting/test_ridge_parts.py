@@ -215,6 +215,7 @@ def test_the_residual_of_held_out_views_is_a_mean_over_those_with_a_map(stage, m
 # Work in parts
 
 
+@pytest.mark.slow
 def test_results_do_not_depend_on_how_many_rows_are_taken_at_once(stage, monkeypatch):
     pytest.importorskip("scipy")
     views, settings = stage.views[:3], LiftSettings(passes=2, ridge=1.0, iterations=2)
