@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Literal
 
 from sgwarp.commands.effects import LABELS, say_unused
-from sgwarp.commands.inputs_kept import LOG, keep_photographs
+from sgwarp.commands.inputs_kept import LOG
 from sgwarp.commands.options import SemanticsOptions, check_name, find_view, find_views, photograph, place_views
 from sgwarp.errors import InputError
 
@@ -47,7 +47,7 @@ class Query(SemanticsOptions):
     """What the text has to beat with --score relevancy."""
 
     threshold: float = 0.5
-    """Least score of a pixel of the mask, where 0 is the scene's median score and 1 its best thousandth."""
+    """Pixels of the mask score more than this, where 0 is the scene's median score and 1 its best thousandth."""
 
     box: int = 9
     """Side of the box over which scores are averaged before the best pixel is taken [pixels]."""
@@ -77,8 +77,6 @@ class Query(SemanticsOptions):
                 say_unused(self, ("encoder", "templates", "score", "canonical"), LABELS)
             predicted = self.load_predicted(gaussians, log)
             views = find_views(self.views, images=self.images)
-            heat = self.out.with_name(f"{self.out.stem}_heat.png")
-            keep_photographs("--out", (self.out, heat), views)
             views = [find_view(views, self.view, self.views)]
             (view,) = place_views(gaussians, self.scene, views, self.transform)
             scores = self._scores(semantics, predicted, log)
@@ -88,6 +86,7 @@ class Query(SemanticsOptions):
                 )
             mask = score_map > self.threshold
             print(f"{self.text}: best pixel ({x}, {y}), score {score_map[y, x]:.3f}; mask {mask.float().mean():.2%}")
+            heat = self.out.with_name(f"{self.out.stem}_heat.png")
             with log.stage("write"):
                 picture = heat_map(photograph(gaussians, view), score_map, low=0.0, high=1.0)
                 write_ids(self.out, mask.byte().mul(255).cpu())

@@ -381,6 +381,8 @@ DISTILL_OPTIONS = {
     "epochs": 7,
     "learning_rate": 0.5,
     "scenes_per_step": 3,
+    "views_per_step": 5,
+    "loss": "contrastive",
     "by_reliability": True,
     "half": True,
     "seed": 9,

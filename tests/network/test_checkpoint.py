@@ -10,7 +10,7 @@ import torch
 
 from sgwarp.errors import InputError
 from sgwarp.network.checkpoint import difference, load_into, net_for, read_weights, without_prefixes
-from sgwarp.network.layers.mink_unet import MinkUNet
+from sgwarp.network.layers.mink_unet import ARCHITECTURES, MinkUNet
 
 
 @pytest.fixture(scope="module")
@@ -127,3 +127,21 @@ def test_code_in_a_file_is_not_run(tmp_path):
 def test_missing_files_are_named(tmp_path):
     with pytest.raises(InputError, match="no such file"):
         read_weights(tmp_path / "none.pth")
+
+
+@pytest.mark.parametrize("arch", list(ARCHITECTURES))
+def test_what_nearly_fits_is_compared_with_the_nearest(arch):
+    """Nine names are missing: the fewest differences count, not how they are spelled."""
+    with torch.device("meta"):
+        state = MinkUNet(3, 8, arch).state_dict()
+    for name in [name for name in state if ".bn." in name][:9]:
+        del state[name]
+    with pytest.raises(InputError) as refused:
+        net_for(state, "old.pth")
+    assert f"; against {arch}: 9 missing: bn0.bn.weight, bn0.bn.bias, " in str(refused.value)
+
+
+def test_prefixes_come_off_as_long_as_all_share_one():
+    assert without_prefixes({}) == {}
+    state = {"module.net3d.a": torch.zeros(1), "module.net3d.b": torch.zeros(2)}
+    assert list(without_prefixes(state)) == ["a", "b"]

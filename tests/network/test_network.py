@@ -312,3 +312,7 @@ def test_training_goes_on_after_a_prediction_in_inference_mode(net, stage):
     voxels, _ = voxelize(stage.gaussians, "full", 0.12)
     with torch.autocast("cpu", dtype=torch.bfloat16):  # its products use scratch memory
         again.net(voxels).features.float().sum().backward()
+
+
+def test_a_network_moves_to_a_device():
+    assert network("xyz-rgb", (3, 2)).to("meta").device == torch.device("meta")

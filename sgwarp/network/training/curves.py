@@ -23,19 +23,16 @@ def write_curves(history: Sequence[Epoch], stem: Path) -> list[Path]:
         return written
     figure = Figure(figsize=(6.4, 3.6), layout="constrained")
     axes = figure.subplots()
-    lines = []
     for name, colour in (("loss", "tab:blue"), ("cosine", "tab:orange"), ("miou", "tab:green")):
         points = [(e.epoch, getattr(e, name)) for e in history if getattr(e, name) is not None]
         if points:
             title = {"loss": "training loss", "cosine": "validation cosine", "miou": "validation mIoU"}[name]
-            lines += axes.plot(
-                *zip(*points, strict=True), color=colour, label=title, marker="." if len(points) < 30 else ""
-            )
+            axes.plot(*zip(*points, strict=True), color=colour, label=title, marker="." if len(points) < 30 else "")
     axes.set_xlabel("epoch")
     axes.set_ylim(bottom=0)
     axes.grid(alpha=0.3)
-    if lines:
-        axes.legend(handles=lines)
+    if axes.lines:
+        axes.legend()
     picture = stem.with_name(f"{stem.name}_curves.png")
     with atomic_path(picture) as temporary:
         figure.savefig(temporary, dpi=120)
