@@ -1,5 +1,6 @@
 """What structure from motion is told reaches the library, seen by a stand-in for it that notes what it is given."""
 
+from contextlib import nullcontext
 from itertools import combinations, pairwise
 from pathlib import Path
 from types import SimpleNamespace
@@ -17,47 +18,6 @@ from sgwarp.reconstruction.stereo import choose_neighbors
 from sgwarp.scene import Camera
 
 SETTINGS = SfmSettings(camera_model="OPENCV", seed=17, threads=3)
-
-
-class Options(SimpleNamespace):
-    """Attributes that spring into being, as deep as they are asked for."""
-
-    def __getattr__(self, name):
-        if name.startswith("__"):
-            raise AttributeError(name)
-        value = Options()
-        setattr(self, name, value)
-        return value
-
-
-class Library:
-    """Notes the calls of functions, in order; options are `Options`."""
-
-    def __init__(self):
-        self.calls = []
-        self.CameraMode = SimpleNamespace(SINGLE="single", PER_IMAGE="each")
-        self.Device = SimpleNamespace(cpu="cpu")
-
-    def __getattr__(self, name):
-        if name.endswith("Options"):
-            return Options
-        if name.startswith("__"):
-            raise AttributeError(name)
-
-        def called(*arguments, **options):
-            self.calls.append((name, arguments, options))
-
-        return called
-
-
-@pytest.fixture
-def library(monkeypatch):
-    found = Library()
-    for module in (features, poses, triangulation):
-        monkeypatch.setattr(module, "require_pycolmap", lambda: found)
-    for module in (features, poses):
-        monkeypatch.setattr(module, "run_cancellable", lambda database, call, watch=None: (watch or int)() or call("t"))
-    return found
 
 
 @pytest.mark.parametrize(("width", "height", "faint"), [(999, 600, True), (600, 999, True), (1000, 600, False)])
@@ -220,9 +180,8 @@ def test_reasons_for_photographs_without_a_pose(library, tmp_path, monkeypatch):
             [SimpleNamespace(inlier_matches=[0] * n) for n in matches.values()],
         ),
         num_keypoints_for_image=keypoints.get,
-        close=lambda: None,
     )
-    library.Database = SimpleNamespace(open=lambda path: data)
+    library.Database = SimpleNamespace(open=lambda path: nullcontext(data))
     library.pair_id_to_image_pair = lambda pair: pair
     found = poses._reasons(tmp_path, {"0": "cannot be read"}, ["1", "2", "3", "4", "5", "6"], ["4", "5"])
     begins = {"0": "cannot be read", "1": "only 199 features", "2": "overlaps no other photograph enough"}
