@@ -87,7 +87,7 @@ def photographs_in(folder: Path) -> list[str]:
     places = {PurePosixPath(name).parent for name in names}
     stems = {str(PurePosixPath(name).with_suffix("")).lower() for name in names}
     own = [name for name in names if not _belongs_to_others(PurePosixPath(name).parent, places)]
-    return [name for name in own if not _belongs_to_photograph(PurePosixPath(name), stems)] or own or names
+    return [name for name in own if not _belongs_to_photograph(PurePosixPath(name), stems)] or names
 
 
 def _belongs_to_photograph(name: PurePosixPath, stems: Set[str]) -> bool:

@@ -202,6 +202,12 @@ def test_notes_that_are_none_are_those_of_another_program(colmap, folder, tmp_pa
     assert (out / "database.db").read_text() == "days of work"
 
 
+def test_photographs_of_formats_that_are_not_read_are_named(colmap, folder, tmp_path, caplog):
+    (folder / "e.heic").touch()
+    estimate_poses(folder, tmp_path / "out", SETTINGS)
+    assert f"{folder}: holds photographs that are not decoded (1 HEIC files)" in caplog.text
+
+
 def test_photographs_that_cannot_be_read_are_left_out_with_the_reason(colmap, folder, tmp_path):
     (folder / "broken.png").write_bytes(b"no image")
     write_rgb(folder / "e.png", np.zeros((8, 8, 3), np.uint8))

@@ -145,11 +145,13 @@ def test_options_of_mapping(library, tmp_path, monkeypatch, first):
     given = []
 
     def mapping(*arguments, options, **rest):
+        assert arguments == (tmp_path / "d.db", tmp_path / "photos", tmp_path / "mapping")
         given.append((options.random_seed, options.num_threads, options.min_model_size, dict(vars(options.mapper))))
         return models if first or len(given) == 2 else {}
 
     monkeypatch.setattr(library, "incremental_mapping", mapping)
-    assert poses._map(tmp_path / "d.db", tmp_path, tmp_path, SETTINGS, 12, lambda *call: None) is models[1]
+    found = poses._map(tmp_path / "d.db", tmp_path / "photos", tmp_path, SETTINGS, 12, lambda *call: None)
+    assert found is models[1]
     assert given[0] == (17, 3, 3, {})
     assert given[1:] == ([] if first else [(17, 3, 3, {"init_min_tri_angle": 4.0, "init_min_num_inliers": 30})])
     assert not (tmp_path / "mapping").exists()
