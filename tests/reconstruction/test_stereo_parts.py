@@ -31,7 +31,7 @@ def camera(place=(0.0, 0.0, 0.0), degrees: float = 0.0, width: int = 20, height:
 def seen_at(camera: Camera, point) -> tuple[float, float, float]:
     """Pixel and depth of a place."""
     x, y, z = camera.world_to_camera[:3].numpy() @ np.append(point, 1.0)
-    fx, fy, cx, cy = 30.0, 25.0, 9.0, 8.0
+    (fx, _, cx), (_, fy, cy), _ = camera.K.tolist()
     return fx * x / z + cx, fy * y / z + cy, z
 
 
@@ -130,20 +130,22 @@ NEIGHBOR = np.fromfunction(lambda r, c: linear(r + 0.5, c + 0.5), (16, 24)).asty
 @pytest.mark.parametrize(("place", "degrees"), [((0.3, 0.1, -0.2), 4.0), ((-0.2, 0.0, 0.3), -6.0)])
 @pytest.mark.parametrize("surface", ["plane", "hills"])
 def test_a_neighbor_is_warped_by_the_places_that_pixels_see(place, degrees, surface):
-    own, other = camera((0.1, 0.0, 0.0), 2.0), camera(place, degrees, 24, 16)
+    own, other = camera((0.1, 0.0, 0.0), 2.0), camera(place, degrees, 48, 32)
+    other = replace(other, K=torch.tensor([[55.0, 0, 20], [0, 60, 17], [0, 0, 1]]))
+    picture = np.fromfunction(lambda r, c: linear(r + 0.5, c + 0.5), (32, 48)).astype(np.float32)
     depth = np.full((14, 20), 2.5)
     if surface == "hills":
         depth += 0.5 * np.random.default_rng(0).random(depth.shape)
-        (found,) = _warped(NEIGHBOR, other, own, depth / 1.25, np.array([1.25]))
+        (found,) = _warped(picture, other, own, depth / 1.25, np.array([1.25]))
     else:
-        found = _warp(NEIGHBOR, other, own, 2.5)
+        found = _warp(picture, other, own, 2.5)
     inside = 0
     for row, column in np.ndindex(14, 20):
         u, v, _ = seen_at(other, place_of(own, column + 0.5, row + 0.5, depth[row, column]))
-        if 0.5 < u < 23.5 and 0.5 < v < 15.5:
+        if 0.5 < u < 47.5 and 0.5 < v < 31.5:
             assert found[row, column] == pytest.approx(linear(v, u), abs=1e-3)  # OpenCV rounds to 1/32 of a pixel
             inside += 1
-        elif not (-0.6 < u < 24.6 and -0.6 < v < 16.6):
+        elif not (-0.6 < u < 48.6 and -0.6 < v < 32.6):
             assert found[row, column] < -1
     assert 100 < inside < 280
 
@@ -223,17 +225,19 @@ def test_points_are_known_that_others_confirm_more_than_contradict(depths, known
     assert bool(found[2:-2, 3:-3].any()) == known
 
 
-def test_a_point_is_looked_for_where_others_see_it():
+@pytest.mark.parametrize("block", [(3, 9, 4, 13), (0, 6, 0, 11), (7, 14, 9, 20)])
+def test_a_point_is_looked_for_where_others_see_it(block):
     """Each of two others agrees in the pixels alone whose rays meet the point, at its edge too, and nowhere behind."""
     own, others = camera(), [camera((0.2, 0.0, 0.0)), camera((-0.2, 0.1, 0.0))]
+    top, bottom, left, right = block
     maps, expected = [np.full((14, 20), 2.0)], np.ones((14, 20), bool)
     for other in others:
         seen = np.zeros((14, 20), bool)
         its = np.full((14, 20), 9.0)
-        its[3:9, 4:13] = 2.0
+        its[top:bottom, left:right] = 2.0
         for row, column in np.ndindex(14, 20):
             u, v, _ = seen_at(other, place_of(own, column + 0.5, row + 0.5, 2.0))
-            seen[row, column] = 4 <= u < 13 and 3 <= v < 9
+            seen[row, column] = left <= u < right and top <= v < bottom
         maps.append(its)
         expected &= seen
     assert 10 < expected.sum() < 80
@@ -251,7 +255,8 @@ def test_maps_are_small_and_their_planes_follow_the_extent(monkeypatch):
         return np.ones((len(planes), *image.shape), np.float32)
 
     monkeypatch.setattr(stereo, "_costs", costs)
-    monkeypatch.setattr(stereo, "refined", lambda depth, *rest: depth)
+    refinement = []
+    monkeypatch.setattr(stereo, "refined", lambda *rest: refinement.append(rest) or rest[0])
     sizes = [(320, 200), (100, 60), (1600, 20)]
     cameras = [camera((0.3 * k, 0.0, 0.0), 0.0, *size) for k, size in enumerate(sizes)]
     images = [np.full((height, width, 3), (0.1, 0.2, 0.6), np.float32) for width, height in sizes]
@@ -262,6 +267,11 @@ def test_maps_are_small_and_their_planes_follow_the_extent(monkeypatch):
     assert all(np.allclose(found.colors, (0.1, 0.2, 0.6)) for found in maps)
     given.sort(key=lambda call: call[0].shape)
     assert all(np.allclose(image, 0.3) and others == 2 for image, _, others, _ in given)
+    for depth, image, camera_of_it, others in refinement:
+        assert depth.shape == image.shape == camera_of_it.size
+        assert [picture.shape for picture, _ in others] == [one.size for _, one in others]
+        assert len(others) == 2
+        assert all(not torch.equal(one.position, camera_of_it.position) for _, one in others)
     planes = given[0][3]
     assert planes[0] == pytest.approx(0.2)
     assert 60 / 1.055 < planes[-1] < 60

@@ -143,8 +143,12 @@ def test_curves_are_drawn_over_the_seconds(tmp_path, monkeypatch):
     assert [(x < 0, y < 0) for x, y in [note.xyann]] == [(True, True)]  # below and beside the point that it is of
     assert (note.get_ha(), note.get_va()) == ("right", "top")
     for axis in (quality, loss):
+        line, x, y = axis.lines[0], axis.xaxis, axis.yaxis
+        assert (line.get_color(), line.get_markersize()) == ("#2d6cb5", 4)
+        assert {x.label.get_color(), y.label.get_color(), note.get_color()} == {"#222222"}
+        assert {grid.get_alpha() for grid in (*x.get_gridlines(), *y.get_gridlines())} == {0.3}
         assert [axis.spines[side].get_visible() for side in ("top", "right", "left")] == [False, False, True]
-        assert not loss.texts
+    assert not loss.texts
     width, height = drawn[0].get_size_inches() * drawn[0].dpi
     assert (width, height) == (1440, 540)
     assert (tmp_path / "curve.png").exists()
@@ -154,6 +158,19 @@ def test_curves_without_matplotlib_are_refused_with_the_remedy(tmp_path, monkeyp
     monkeypatch.setitem(sys.modules, "matplotlib.figure", None)
     with pytest.raises(InputError, match=r"the plot of a fit needs matplotlib; run: pip install"):
         report.draw_curve([Measurement(1, 1.0, 1.0, 1.0, 1)], tmp_path / "curve.png")
+
+
+def test_what_is_brighter_than_white_is_shown_and_compared_as_white(monkeypatch):
+    camera = Camera(torch.tensor([[30.0, 0, 20], [0, 30, 10], [0, 0, 1]]), torch.eye(4), 40, 20)
+    photograph = Photograph("a", camera, torch.full((20, 40, 3), 255, dtype=torch.uint8))
+    drawn = []
+    for shade in (1.0, 3.0):
+        features = torch.full((20, 40, 3), shade)
+        monkeypatch.setattr(
+            report, "rasterize", lambda *rest, shown=features, **options: SimpleNamespace(features=shown)
+        )
+        drawn.append(report._row(scene(1), photograph, False)[30:])
+    np.testing.assert_array_equal(*drawn)
 
 
 def test_titles_of_a_contact_sheet_can_be_read():

@@ -2,7 +2,6 @@
 
 from contextlib import nullcontext
 from itertools import combinations, pairwise
-from pathlib import Path
 from types import SimpleNamespace
 
 import cv2
@@ -12,7 +11,7 @@ import torch
 
 from sgwarp.errors import InputError
 from sgwarp.files.images import write_rgb
-from sgwarp.reconstruction.sfm import features, poses, triangulation, video
+from sgwarp.reconstruction.sfm import features, poses, triangulation
 from sgwarp.reconstruction.sfm.features import SfmSettings, choose_pairs
 from sgwarp.reconstruction.stereo import choose_neighbors
 from sgwarp.scene import Camera
@@ -231,64 +230,3 @@ def test_photographs_are_made_small_for_features_with_their_camera(tmp_path, siz
     assert camera.size == stored
     assert camera.K[0, 0].item() == pytest.approx(2000 * stored[1] / size[1])
     assert cv2.imread(str(tmp_path / "a.png")).shape == (*stored, 3)
-
-
-class Film:
-    """A video of so many gray frames, which grow sharper within each `period`."""
-
-    def __init__(self, count: int, period: int = 1) -> None:
-        self.count, self.at, self.period = count, 0, period
-
-    def get(self, key):
-        return self.count
-
-    def read(self):
-        if self.at == self.count:
-            return False, None
-        frame = np.full((8, 8, 3), 100, np.uint8)
-        frame[::2] += np.uint8(10 * (self.at % self.period) + 5)
-        self.at += 1
-        return True, frame
-
-    def release(self):
-        pass
-
-
-@pytest.fixture
-def film_file(tmp_path):
-    """The file that a stand-in for OpenCV does not read."""
-    path = tmp_path / "film.mp4"
-    path.touch()
-    return path
-
-
-@pytest.mark.parametrize(
-    ("count", "every", "kept"),
-    [(30, None, 10), (450, None, 150), (600, None, 150), (1500, None, 150), (30, 1, 30), (31, 10, 4)],
-)
-def test_frames_of_a_video(monkeypatch, tmp_path, film_file, count, every, kept):
-    """About 150 of them, but at most one of three, unless the interval is given."""
-    written = []
-    monkeypatch.setattr(cv2, "VideoCapture", lambda name: Film(count))
-    monkeypatch.setattr(cv2, "imwrite", lambda name, frame, options: written.append((Path(name).name, options)))
-    assert video.extract_frames(film_file, tmp_path / "frames", every) == kept
-    assert [name for name, _ in written] == [f"{k:05d}.jpg" for k in range(kept)]
-    assert all(options == [cv2.IMWRITE_JPEG_QUALITY, 95] for _, options in written)
-
-
-def test_a_video_of_few_frames_is_refused(monkeypatch, tmp_path, film_file):
-    monkeypatch.setattr(cv2, "VideoCapture", lambda name: Film(6))
-    monkeypatch.setattr(cv2, "imwrite", lambda *rest: True)
-    with pytest.raises(InputError, match="6 frames can be read, of which 2 remain"):
-        video.extract_frames(film_file, tmp_path / "frames")
-    assert not (tmp_path / "frames").exists()
-    with pytest.raises(InputError, match="--every: expected at least 1, got 0"):
-        video.extract_frames(film_file, tmp_path / "frames", 0)
-
-
-def test_the_sharpest_frame_stands_for_its_interval(monkeypatch, tmp_path, film_file):
-    written = []
-    monkeypatch.setattr(cv2, "VideoCapture", lambda name: Film(12, 4))
-    monkeypatch.setattr(cv2, "imwrite", lambda name, frame, options: written.append(int(frame.max())))
-    assert video.extract_frames(film_file, tmp_path / "frames", 4) == 3
-    assert written == [135] * 3
