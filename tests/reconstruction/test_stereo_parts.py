@@ -246,6 +246,12 @@ def test_a_point_is_looked_for_where_others_see_it(block):
     assert not _confirmed(0, [maps[0]] * 3, [own, *turned]).any()
 
 
+def test_small_copies_are_means_of_their_pixels():
+    image = np.random.default_rng(0).random((6, 9, 3)).astype(np.float32)
+    found = stereo._shrink(image, (2, 3))
+    np.testing.assert_allclose(found, image.reshape(2, 3, 3, 3, 3).mean(axis=(1, 3)), rtol=1e-5)
+
+
 def test_maps_are_small_and_their_planes_follow_the_extent(monkeypatch):
     """At most 160 pixels, at least a window of 5; from a tenth of the extent to thirty of them, at steps of 5.5 %."""
     given, reports = [], []
