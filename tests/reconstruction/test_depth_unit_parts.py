@@ -1,6 +1,7 @@
 """The unit of depth images: which points are compared, what is counted of them, and which factor is believed."""
 
 import math
+import warnings
 
 import numpy as np
 import pytest
@@ -100,6 +101,7 @@ class Agreement:
         ((0.79, 0.94, 0.75, 0.78, 0.8, 0.77, 0.77), 1, 1, 0.94),
         ((0.8, 0.8, 0.79, 0.78, 0.8, 0.77, 0.77), 0, 6, 0.8),
         ((0.1, 0.1, 0.1, 0.1, 0.1, 0.1, 0.5), 6, 6, 0.5),
+        ((0.1, 0.95, 1.0, 0.95, 0.94, 1.0, 0.1), 1, 3, 1.0),  # just as good as that
     ],
 )
 def test_the_middle_of_what_is_nearly_as_good_is_taken(values, low, high, most):
@@ -109,8 +111,14 @@ def test_the_middle_of_what_is_nearly_as_good_is_taken(values, low, high, most):
 
 
 def measured(monkeypatch, of_factor, points: int = 1000):
-    monkeypatch.setattr(depth_unit, "_Pairs", lambda *given: Agreement(of_factor, points))
-    return measure_depth_unit([], [], 1.0)
+    depths, cameras = [np.ones((10, 12))], [camera((0, 0, 0))]
+
+    def pairs(*given):
+        assert given == (depths, cameras, 2.5)
+        return Agreement(of_factor, points)
+
+    monkeypatch.setattr(depth_unit, "_Pairs", pairs)
+    return measure_depth_unit(depths, cameras, 2.5)
 
 
 def around(true: float, most: float, else_where: float = 0.02, width: float = 0.04):
@@ -173,13 +181,21 @@ def test_another_unit_has_to_be_clearly_better(monkeypatch, as_given, most, beli
 
 
 def test_a_finer_search_may_find_more(monkeypatch):
-    """The best of both searches is what the depth as it was given is held against."""
-    peak = [math.log(0.3)]
+    """The best of both searches is what depth as it was given is held against: here the first one just misses it."""
+    true = 1e-5 * 1.08**134.5  # between two factors that are tried, at which it is 0.68
 
     def agreement(factor):
-        off = abs(math.log(factor) - peak[0])
-        return 0.6 if factor == 1 else max(0.0, 0.99 - 8 * off)
+        return 0.66 if factor == 1 else max(0.0, 0.99 - 8 * abs(math.log(factor / true)))
 
     found = measured(monkeypatch, agreement)
-    assert found.factor == pytest.approx(0.3, rel=0.01)
-    assert found.agreement > 0.9
+    assert found.factor == pytest.approx(true, rel=0.005)
+    assert found.agreement > 0.95
+
+
+def test_points_beside_a_camera_are_in_no_pixel():
+    """However far beyond the image the division takes them, nothing overflows."""
+    points = np.array([[1.0, 0.0, 1e-300], [-1.0, 1.0, 1e-300], [0.0, 0.0, 3.0], [0.0, 0.0, -3.0]])
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        found = depth_unit._ratios(points, 1.0, np.full((10, 12), 2.0), camera((0, 0, 0)))
+    assert found.tolist() == [1.5]

@@ -149,6 +149,8 @@ def test_curves_are_drawn_over_the_seconds(tmp_path, monkeypatch):
         assert {grid.get_alpha() for grid in (*x.get_gridlines(), *y.get_gridlines())} == {0.3}
         assert [axis.spines[side].get_visible() for side in ("top", "right", "left")] == [False, False, True]
     assert not loss.texts
+    assert drawn[0].get_facecolor() == (1, 1, 1, 1)
+    assert drawn[0].get_layout_engine() is not None  # so that labels do not overlap
     width, height = drawn[0].get_size_inches() * drawn[0].dpi
     assert (width, height) == (1440, 540)
     assert (tmp_path / "curve.png").exists()

@@ -47,6 +47,12 @@ def test_points_are_counted_by_the_photographs_that_show_them(caplog):
     assert "so close together" not in text
 
 
+def test_cameras_in_one_place_have_no_parallax(caplog):
+    """Cosines that rounding lifts above 1 are no angle."""
+    points = torch.rand(500, 3, generator=torch.Generator().manual_seed(0)) + torch.tensor([0.0, 0.0, 8.0])
+    assert "parallax 0 degrees" in said(caplog, [black(0.0)] * 3, points.tolist())
+
+
 def test_points_that_no_photograph_shows_have_no_distance(caplog):
     text = said(caplog, [black(0.0), black(1.0), black(2.0)], [[0.0, 0, -10]] * 2)
     assert "2 to start from, 0 % in view of 3 or more photographs; medians: distance nan, parallax 0 degrees" in text
