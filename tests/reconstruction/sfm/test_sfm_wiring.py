@@ -137,6 +137,12 @@ def test_neighbors_lie_a_little_beside_whatever_the_unit(extent):
     assert found[0] == [2, 3, 4, 6, 9, 13]
 
 
+def test_of_those_equally_far_the_first_are_taken():
+    cameras = [looking((0, 0, 0)), *[looking((1.0, 0, 0))] * 60]
+    assert choose_neighbors(cameras, 1.0)[0] == [1, 2, 3, 5, 8, 12]
+    assert {b for a, b in triangulation._pairs(cameras) if a == 0} == {*range(1, 21)}
+
+
 @pytest.mark.parametrize("first", [True, False])
 def test_options_of_mapping(library, tmp_path, monkeypatch, first):
     """COLMAP's own first; where no two photographs can be placed so, two that are closer together."""
