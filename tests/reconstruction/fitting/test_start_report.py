@@ -8,14 +8,16 @@ import pytest
 import torch
 
 from sgwarp.errors import InputError
-from sgwarp.reconstruction.fitting import initial
+from sgwarp.reconstruction.depth_unit import DepthUnit
+from sgwarp.reconstruction.fitting import depth_start, initial
 from sgwarp.reconstruction.fitting.coverage import in_view, report_start
 from sgwarp.reconstruction.fitting.densify import Densify
 from sgwarp.reconstruction.fitting.frame import Frame
 from sgwarp.reconstruction.fitting.model import Model
 from sgwarp.reconstruction.fitting.photographs import Photograph
 from sgwarp.reconstruction.fitting.settings import FitSettings
-from sgwarp.scene import Camera, Gaussians
+from sgwarp.scene import Camera, Gaussians, View
+from sgwarp.scene.extent import camera_extent
 
 K = torch.tensor([[40.0, 0, 20], [0, 40, 15], [0, 0, 1]])
 FRAME = Frame(torch.zeros(3).double(), 5.0, None)
@@ -205,3 +207,47 @@ def test_a_needle_is_split_by_its_length(longest, split):
     strategy._grow(model, 600)
     assert len(model) == 4
     assert int((model["scales"][:, 1] < 0.9 * longest).sum()) == (2 if split else 0)
+
+
+# Depth to start from.
+
+
+def posed(count: int) -> list[View]:
+    return [View(str(k), black(float(k)).camera) for k in range(count)]
+
+
+def test_depth_is_measured_where_it_is_known(monkeypatch, caplog):
+    given = []
+
+    def depth(view):
+        if view.stem == "1":
+            raise InputError("1.png: no such file")
+        return np.tile(np.array([np.nan, -1.0, np.inf, 2.0], np.float32), (30, 10))
+
+    def measure(depths, cameras, extent):
+        given.append((depths, cameras, extent))
+        return DepthUnit(0.001, 0.9, 0.12)
+
+    monkeypatch.setattr(depth_start, "measure_depth_unit", measure)
+    views = posed(3)
+    usable = depth_start.usable_depth("here", depth, views)
+    (((first, second, third), cameras, extent),) = given
+    assert first[0, :5].tolist() == third[29, :5].tolist() == [0, 0, 0, 2, 0]
+    assert second.shape == (30, 40)
+    assert not second.any()
+    assert [camera.size for camera in cameras] == [(30, 40)] * 3
+    assert [camera.position[0].item() for camera in cameras] == [0, 1, 2]
+    assert extent == camera_extent(views)
+    assert "here: 1 of 3 views have no depth, first: 1.png: no such file" in caplog.text
+    assert "at 0.001 times the depth 90 % of the points" in caplog.text
+    assert "as given 12 %; the depth is multiplied by it" in caplog.text
+    assert usable(views[0])[0, 3] == np.float32(0.002)
+    assert not usable(views[1]).any()
+
+
+def test_depth_of_no_view_is_an_error():
+    def depth(view):
+        raise InputError(f"{view.stem}.png: no such file")
+
+    with pytest.raises(InputError, match=r"^0\.png: no such file"):
+        depth_start.usable_depth("here", depth, posed(2))

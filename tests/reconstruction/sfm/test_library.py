@@ -53,6 +53,7 @@ def test_a_call_runs_beside_and_its_progress_is_watched(tmp_path, token):
     def call(given):
         assert given is token
         assert threading.current_thread() is not threading.main_thread()
+        assert threading.current_thread().daemon  # a process that ends does not wait for it
         assert enough.wait(20)
         return "what it found"
 
