@@ -8,12 +8,13 @@ import pytest
 import torch
 
 from sgwarp.errors import InputError
+from sgwarp.ops.adam import count_steps
 from sgwarp.reconstruction.depth_unit import DepthUnit
 from sgwarp.reconstruction.fitting import depth_start, initial
 from sgwarp.reconstruction.fitting.coverage import in_view, report_start
 from sgwarp.reconstruction.fitting.densify import Densify
 from sgwarp.reconstruction.fitting.frame import Frame
-from sgwarp.reconstruction.fitting.model import Model
+from sgwarp.reconstruction.fitting.model import Gradients, Model
 from sgwarp.reconstruction.fitting.photographs import Photograph
 from sgwarp.reconstruction.fitting.settings import FitSettings
 from sgwarp.scene import Camera, Gaussians, View
@@ -141,13 +142,15 @@ def test_what_a_mask_hides_starts_nothing(maps):
     assert positions[:, 0].tolist() == [*range(0, 800, 2), *range(2400, 3200, 4)]
 
 
-@pytest.mark.parametrize("name", ["random", "more", "cap"])
+@pytest.mark.parametrize("name", ["random", "more", "cap", "anywhere"])
 def test_the_seed_alone_decides_which_points_are_drawn(maps, name):
     def drawn(seed: int, around: int) -> torch.Tensor:
         torch.manual_seed(around)  # of whoever else draws
         settings = FitSettings(cap=800, seed=seed)
         if name == "random":
             return initial.random_points(PAIR, settings)[0]
+        if name == "anywhere":
+            return initial._points_anywhere(PAIR, 50, torch.Generator().manual_seed(seed))[0]
         if name == "more":
             few = torch.zeros(10, 3, dtype=torch.float64), np.zeros((10, 3))
             return initial.completed(*few, PAIR, settings, len)[0]
@@ -207,6 +210,41 @@ def test_a_needle_is_split_by_its_length(longest, split):
     strategy._grow(model, 600)
     assert len(model) == 4
     assert int((model["scales"][:, 1] < 0.9 * longest).sum()) == (2 if split else 0)
+
+
+@pytest.mark.parametrize(
+    ("total", "views", "grows"),
+    [
+        (0.00021, 1, True),
+        (0.00019, 1, False),
+        (0.00041, 2, True),
+        (0.00039, 2, False),
+        (0.00041, 3, False),
+        (0, 0, False),
+    ],
+)
+def test_what_the_loss_moves_in_the_mean_of_its_views_grows(total, views, grows):
+    quats = torch.tensor([1.0, 0, 0, 0]).expand(3, 4)
+    scales, opacities = torch.full((3, 3), 0.005), torch.full((3,), 0.5)
+    model = Model.starting(Gaussians(torch.zeros(3, 3), quats, scales, opacities, torch.zeros(3, 1, 3)))
+    strategy = Densify(FitSettings(strategy="default"), 1.0, 1000, 3, torch.device("cpu"))
+    strategy.sums[1], strategy.views[1] = total, views
+    strategy._grow(model, 600)
+    assert len(model) == 3 + grows
+
+
+@pytest.mark.parametrize(("step", "resets"), [(12_000, True), (15_000, False)])
+def test_the_last_reset_leaves_time_to_recover(step, resets):
+    """At 15,000 steps of 30,000 the set of Gaussians is what it will be."""
+    quats = torch.tensor([1.0, 0, 0, 0]).expand(3, 4)
+    scales, opacities = torch.full((3, 3), 0.005), torch.full((3,), 0.5)
+    model = Model.starting(Gaussians(torch.zeros(3, 3), quats, scales, opacities, torch.zeros(3, 1, 3)))
+    strategy = Densify(FitSettings(strategy="default", steps=30_000), 1.0, 1000, 3, torch.device("cpu"))
+    counts = torch.zeros(3, dtype=torch.int32)
+    taken = count_steps(torch.ones(3), torch.zeros(3, 1, 3), counts, counts.clone(), sparse=True)
+    blank = {name: torch.zeros_like(model[name]) for name in model.groups}
+    strategy.after_step(model, step, Gradients(**blank, means2d=torch.zeros(3, 2)), taken, black(0.0).camera)
+    assert bool((model["opacities"] < 0.1).all()) == resets
 
 
 # Depth to start from.
