@@ -113,7 +113,9 @@ def main() -> None:
         steps=steps, cap=options.cap, evaluate_every=max(1, steps // EVALUATIONS), degree_every=max(1, steps // 4)
     )
     for start in options.starts:
-        row = mean_of([measure(start, Path(data) / "room", settings, options.downscale) for _ in range(options.repeats)])
+        row = mean_of(
+            [measure(start, Path(data) / "room", settings, options.downscale) for _ in range(options.repeats)]
+        )
         results = json.loads(options.out.read_text()) if options.out.is_file() else {}
         results[start] = row | {"steps": steps, "cap": options.cap, "downscale": options.downscale}
         with atomic_path(options.out) as temporary:

@@ -100,11 +100,15 @@ class Loop:
     ) -> bool:
         settings = self.settings
         began, first = time.perf_counter(), self.step
+
+        def rate() -> float:
+            return (self.step - first) / max(time.perf_counter() - began, 1e-9)
+
         while self.step < settings.steps:
             if interrupted():
                 return False
             if self.step % REPORT_EVERY == 0:
-                report(self.step, settings.steps, self._text((self.step - first) / (time.perf_counter() - began)))
+                report(self.step, settings.steps, self._text(rate()))
             with self._timed():
                 refine = self._take_step()
             # Before the refinement, as the reference does: it may have just made all Gaussians transparent.
@@ -117,7 +121,7 @@ class Loop:
                 self._settle()
                 with self.log.stage("checkpoint"):
                     self.try_to_save(checkpoint)
-        report(self.step, settings.steps, self._text((self.step - first) / max(time.perf_counter() - began, 1e-9)))
+        report(self.step, settings.steps, self._text(rate()))
         return True
 
     @contextmanager
@@ -184,9 +188,13 @@ class Loop:
         gradients = Gradients(**grads, means2d=centres.grad)  # type: ignore[arg-type]
         share = self.step / settings.steps
         taken = model.update(gradients, settings.means_rate_at(self.step, self.extent), settings)
-        if self.exposure is not None and colour_map is not None and colour_map.grad is not None:
+        if self.exposure is not None:
+            assert colour_map is not None
+            assert colour_map.grad is not None
             self.exposure.update(index, colour_map.grad, share)
-        if self.poses is not None and correction is not None and correction.grad is not None:
+        if self.poses is not None:
+            assert correction is not None
+            assert correction.grad is not None
             self.poses.update(index, correction.grad, share)
         self._unseen += (taken.marks == 0).sum()
         value = loss.detach().to(torch.float64)

@@ -99,11 +99,8 @@ def _camera_of(database: Path, names: set[str]) -> int | None:
     """The camera of those of these photographs that are stored already, or None."""
     if not database.is_file():
         return None
-    data = require_pycolmap().Database.open(database)
-    try:
+    with require_pycolmap().Database.open(database) as data:
         return next((image.camera_id for image in data.read_all_images() if image.name in names), None)
-    finally:
-        data.close()
 
 
 def match_features(database: Path, pairs: Sequence[tuple[str, str]], settings: SfmSettings, report: Report) -> None:

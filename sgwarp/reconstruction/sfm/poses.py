@@ -87,7 +87,7 @@ def photographs_in(folder: Path) -> list[str]:
     places = {PurePosixPath(name).parent for name in names}
     stems = {str(PurePosixPath(name).with_suffix("")).lower() for name in names}
     own = [name for name in names if not _belongs_to_others(PurePosixPath(name).parent, places)]
-    return [name for name in own if not _belongs_to_photograph(PurePosixPath(name), stems)] or own or names
+    return [name for name in own if not _belongs_to_photograph(PurePosixPath(name), stems)] or names
 
 
 def _belongs_to_photograph(name: PurePosixPath, stems: Set[str]) -> bool:
@@ -165,7 +165,7 @@ def estimate_poses(
     found.left_out.update(_reasons(database, unreadable, readable, found.registered))
     _keep(model, folder, out)
     _write_notes(out, {"fingerprint": own, **asdict(found)})
-    database.unlink(missing_ok=True)
+    database.unlink()
     return found
 
 
@@ -288,22 +288,21 @@ def _reasons(
     """Why photographs have no pose, as far as the database tells."""
     pycolmap = require_pycolmap()
     reasons = dict(unreadable)
-    data = pycolmap.Database.open(database)
-    images = {image.name: image.image_id for image in data.read_all_images()}
-    best: dict[int, int] = {}
-    for pair, geometry in zip(*data.read_two_view_geometries(), strict=True):
-        for number in pycolmap.pair_id_to_image_pair(pair):
-            best[number] = max(best.get(number, 0), len(geometry.inlier_matches))
-    for name in set(readable) - set(registered):
-        number = images.get(name, 0)
-        features = data.num_keypoints_for_image(number) if number else 0
-        if features < FEW_FEATURES:
-            reasons[name] = f"only {features} features: blurred, dark, or of something even"
-        elif best.get(number, 0) < FEW_MATCHES:
-            reasons[name] = "overlaps no other photograph enough"
-        else:
-            reasons[name] = "overlaps others, but shows too few of the points that they have in common"
-    data.close()
+    with pycolmap.Database.open(database) as data:
+        images = {image.name: image.image_id for image in data.read_all_images()}
+        best: dict[int, int] = {}
+        for pair, geometry in zip(*data.read_two_view_geometries(), strict=True):
+            for number in pycolmap.pair_id_to_image_pair(pair):
+                best[number] = max(best.get(number, 0), len(geometry.inlier_matches))
+        for name in set(readable) - set(registered):
+            number = images.get(name, 0)
+            features = data.num_keypoints_for_image(number) if number else 0
+            if features < FEW_FEATURES:
+                reasons[name] = f"only {features} features: blurred, dark, or of something even"
+            elif best.get(number, 0) < FEW_MATCHES:
+                reasons[name] = "overlaps no other photograph enough"
+            else:
+                reasons[name] = "overlaps others, but shows too few of the points that they have in common"
     return dict(sorted(reasons.items()))
 
 

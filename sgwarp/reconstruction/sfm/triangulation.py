@@ -111,15 +111,14 @@ class _Model:
         for name, camera in zip(self.names, self.cameras, strict=True):
             intrinsics = (*camera.K.diagonal()[:2].tolist(), *camera.K[:2, 2].tolist(), *camera.size)
             groups[intrinsics].append(name)
-        data = library.Database.open(self.database)
-        for number, (fx, fy, cx, cy, height, width) in enumerate(groups, start=1):
-            lens = library.Camera(
-                model="PINHOLE", width=int(width), height=int(height), params=[fx, fy, cx, cy], camera_id=number
-            )
-            lens.has_prior_focal_length = True
-            data.write_camera(lens, use_camera_id=True)
-            self.lenses[number] = lens
-        data.close()
+        with library.Database.open(self.database) as data:
+            for number, (fx, fy, cx, cy, height, width) in enumerate(groups, start=1):
+                lens = library.Camera(
+                    model="PINHOLE", width=int(width), height=int(height), params=[fx, fy, cx, cy], camera_id=number
+                )
+                lens.has_prior_focal_length = True
+                data.write_camera(lens, use_camera_id=True)
+                self.lenses[number] = lens
         done = 0
         for number, names in enumerate(groups.values(), start=1):
             for start in range(0, len(names), PHOTOGRAPHS_AT_ONCE):
@@ -139,13 +138,12 @@ class _Model:
         model = library.Reconstruction()
         for lens in self.lenses.values():
             model.add_camera_with_trivial_rig(lens)
-        data = library.Database.open(self.database)
-        for image in data.read_all_images():
-            camera = self.cameras[self.names.index(image.name)]
-            pose = library.Rigid3d(camera.world_to_camera[:3].numpy())
-            placed = library.Image(name=image.name, camera_id=image.camera_id, image_id=image.image_id)
-            model.add_image_with_trivial_frame(placed, pose)
-        data.close()
+        with library.Database.open(self.database) as data:
+            for image in data.read_all_images():
+                camera = self.cameras[self.names.index(image.name)]
+                pose = library.Rigid3d(camera.world_to_camera[:3].numpy())
+                placed = library.Image(name=image.name, camera_id=image.camera_id, image_id=image.image_id)
+                model.add_image_with_trivial_frame(placed, pose)
         out = self.folder / "model"
         out.mkdir()
         options = library.IncrementalPipelineOptions()

@@ -112,9 +112,8 @@ def _read_origin(folder: Path) -> dict[str, Any] | None:
 def _sharpness(frame: np.ndarray) -> float:
     import cv2
 
-    height, width = frame.shape[:2]
-    factor = min(1.0, SMALL / width)
     gray = cv2.cvtColor(frame, cv2.COLOR_BGR2GRAY)
-    size = (max(1, round(factor * width)), max(1, round(factor * height)))
-    small = cv2.resize(gray, size, interpolation=cv2.INTER_AREA)
-    return float(cv2.Laplacian(small, cv2.CV_32F).var())
+    height, width = gray.shape
+    if width > SMALL:
+        gray = cv2.resize(gray, (SMALL, max(1, round(SMALL * height / width))), interpolation=cv2.INTER_AREA)
+    return float(cv2.Laplacian(gray, cv2.CV_32F).var())

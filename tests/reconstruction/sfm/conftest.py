@@ -1,6 +1,7 @@
-"""Photographs of a room's corner, papered with noise: what features and plane sweeps like to see."""
+"""Photographs of a room's corner, papered with noise, which features and plane sweeps like; a stand-in for pycolmap."""
 
 from pathlib import Path
+from types import SimpleNamespace
 
 import cv2
 import numpy as np
@@ -8,6 +9,7 @@ import pytest
 import torch
 
 from sgwarp.files.images import write_rgb
+from sgwarp.reconstruction.sfm import features, poses, triangulation
 from sgwarp.scene import Camera, View
 
 WIDTH, HEIGHT, FOCAL, COUNT = 256, 192, 220.0, 8
@@ -67,3 +69,44 @@ def corner(tmp_path_factory, shots) -> tuple[Path, list[View]]:
         write_rgb(path, image)
         views.append(View(path.stem, camera, path))
     return folder, views
+
+
+class Options(SimpleNamespace):
+    """Attributes that spring into being, as deep as they are asked for."""
+
+    def __getattr__(self, name):
+        if name.startswith("__"):
+            raise AttributeError(name)
+        value = Options()
+        setattr(self, name, value)
+        return value
+
+
+class Library:
+    """Notes the calls of functions, in order; options are `Options`."""
+
+    def __init__(self):
+        self.calls = []
+        self.CameraMode = SimpleNamespace(SINGLE="single", PER_IMAGE="each")
+        self.Device = SimpleNamespace(cpu="cpu")
+
+    def __getattr__(self, name):
+        if name.endswith("Options"):
+            return Options
+        if name.startswith("__"):
+            raise AttributeError(name)
+
+        def called(*arguments, **options):
+            self.calls.append((name, arguments, options))
+
+        return called
+
+
+@pytest.fixture
+def library(monkeypatch):
+    found = Library()
+    for module in (features, poses, triangulation):
+        monkeypatch.setattr(module, "require_pycolmap", lambda: found)
+    for module in (features, poses, triangulation):
+        monkeypatch.setattr(module, "run_cancellable", lambda database, call, watch=None: (watch or int)() or call("t"))
+    return found

@@ -1,7 +1,7 @@
 """What structure from motion is told reaches the library, seen by a stand-in for it that notes what it is given."""
 
+from contextlib import nullcontext
 from itertools import combinations, pairwise
-from pathlib import Path
 from types import SimpleNamespace
 
 import cv2
@@ -11,53 +11,12 @@ import torch
 
 from sgwarp.errors import InputError
 from sgwarp.files.images import write_rgb
-from sgwarp.reconstruction.sfm import features, poses, triangulation, video
+from sgwarp.reconstruction.sfm import features, poses, triangulation
 from sgwarp.reconstruction.sfm.features import SfmSettings, choose_pairs
 from sgwarp.reconstruction.stereo import choose_neighbors
 from sgwarp.scene import Camera
 
 SETTINGS = SfmSettings(camera_model="OPENCV", seed=17, threads=3)
-
-
-class Options(SimpleNamespace):
-    """Attributes that spring into being, as deep as they are asked for."""
-
-    def __getattr__(self, name):
-        if name.startswith("__"):
-            raise AttributeError(name)
-        value = Options()
-        setattr(self, name, value)
-        return value
-
-
-class Library:
-    """Notes the calls of functions, in order; options are `Options`."""
-
-    def __init__(self):
-        self.calls = []
-        self.CameraMode = SimpleNamespace(SINGLE="single", PER_IMAGE="each")
-        self.Device = SimpleNamespace(cpu="cpu")
-
-    def __getattr__(self, name):
-        if name.endswith("Options"):
-            return Options
-        if name.startswith("__"):
-            raise AttributeError(name)
-
-        def called(*arguments, **options):
-            self.calls.append((name, arguments, options))
-
-        return called
-
-
-@pytest.fixture
-def library(monkeypatch):
-    found = Library()
-    for module in (features, poses, triangulation):
-        monkeypatch.setattr(module, "require_pycolmap", lambda: found)
-    for module in (features, poses):
-        monkeypatch.setattr(module, "run_cancellable", lambda database, call, watch=None: (watch or int)() or call("t"))
-    return found
 
 
 @pytest.mark.parametrize(("width", "height", "faint"), [(999, 600, True), (600, 999, True), (1000, 600, False)])
@@ -178,6 +137,12 @@ def test_neighbors_lie_a_little_beside_whatever_the_unit(extent):
     assert found[0] == [2, 3, 4, 6, 9, 13]
 
 
+def test_of_those_equally_far_the_first_are_taken():
+    cameras = [looking((0, 0, 0)), *[looking((1.0, 0, 0))] * 60]
+    assert choose_neighbors(cameras, 1.0)[0] == [1, 2, 3, 5, 8, 12]
+    assert {b for a, b in triangulation._pairs(cameras) if a == 0} == {*range(1, 21)}
+
+
 @pytest.mark.parametrize("first", [True, False])
 def test_options_of_mapping(library, tmp_path, monkeypatch, first):
     """COLMAP's own first; where no two photographs can be placed so, two that are closer together."""
@@ -185,11 +150,13 @@ def test_options_of_mapping(library, tmp_path, monkeypatch, first):
     given = []
 
     def mapping(*arguments, options, **rest):
+        assert arguments == (tmp_path / "d.db", tmp_path / "photos", tmp_path / "mapping")
         given.append((options.random_seed, options.num_threads, options.min_model_size, dict(vars(options.mapper))))
         return models if first or len(given) == 2 else {}
 
     monkeypatch.setattr(library, "incremental_mapping", mapping)
-    assert poses._map(tmp_path / "d.db", tmp_path, tmp_path, SETTINGS, 12, lambda *call: None) is models[1]
+    found = poses._map(tmp_path / "d.db", tmp_path / "photos", tmp_path, SETTINGS, 12, lambda *call: None)
+    assert found is models[1]
     assert given[0] == (17, 3, 3, {})
     assert given[1:] == ([] if first else [(17, 3, 3, {"init_min_tri_angle": 4.0, "init_min_num_inliers": 30})])
     assert not (tmp_path / "mapping").exists()
@@ -220,9 +187,8 @@ def test_reasons_for_photographs_without_a_pose(library, tmp_path, monkeypatch):
             [SimpleNamespace(inlier_matches=[0] * n) for n in matches.values()],
         ),
         num_keypoints_for_image=keypoints.get,
-        close=lambda: None,
     )
-    library.Database = SimpleNamespace(open=lambda path: data)
+    library.Database = SimpleNamespace(open=lambda path: nullcontext(data))
     library.pair_id_to_image_pair = lambda pair: pair
     found = poses._reasons(tmp_path, {"0": "cannot be read"}, ["1", "2", "3", "4", "5", "6"], ["4", "5"])
     begins = {"0": "cannot be read", "1": "only 199 features", "2": "overlaps no other photograph enough"}
@@ -270,64 +236,3 @@ def test_photographs_are_made_small_for_features_with_their_camera(tmp_path, siz
     assert camera.size == stored
     assert camera.K[0, 0].item() == pytest.approx(2000 * stored[1] / size[1])
     assert cv2.imread(str(tmp_path / "a.png")).shape == (*stored, 3)
-
-
-class Film:
-    """A video of so many gray frames, which grow sharper within each `period`."""
-
-    def __init__(self, count: int, period: int = 1) -> None:
-        self.count, self.at, self.period = count, 0, period
-
-    def get(self, key):
-        return self.count
-
-    def read(self):
-        if self.at == self.count:
-            return False, None
-        frame = np.full((8, 8, 3), 100, np.uint8)
-        frame[::2] += np.uint8(10 * (self.at % self.period) + 5)
-        self.at += 1
-        return True, frame
-
-    def release(self):
-        pass
-
-
-@pytest.fixture
-def film_file(tmp_path):
-    """The file that a stand-in for OpenCV does not read."""
-    path = tmp_path / "film.mp4"
-    path.touch()
-    return path
-
-
-@pytest.mark.parametrize(
-    ("count", "every", "kept"),
-    [(30, None, 10), (450, None, 150), (600, None, 150), (1500, None, 150), (30, 1, 30), (31, 10, 4)],
-)
-def test_frames_of_a_video(monkeypatch, tmp_path, film_file, count, every, kept):
-    """About 150 of them, but at most one of three, unless the interval is given."""
-    written = []
-    monkeypatch.setattr(cv2, "VideoCapture", lambda name: Film(count))
-    monkeypatch.setattr(cv2, "imwrite", lambda name, frame, options: written.append((Path(name).name, options)))
-    assert video.extract_frames(film_file, tmp_path / "frames", every) == kept
-    assert [name for name, _ in written] == [f"{k:05d}.jpg" for k in range(kept)]
-    assert all(options == [cv2.IMWRITE_JPEG_QUALITY, 95] for _, options in written)
-
-
-def test_a_video_of_few_frames_is_refused(monkeypatch, tmp_path, film_file):
-    monkeypatch.setattr(cv2, "VideoCapture", lambda name: Film(6))
-    monkeypatch.setattr(cv2, "imwrite", lambda *rest: True)
-    with pytest.raises(InputError, match="6 frames can be read, of which 2 remain"):
-        video.extract_frames(film_file, tmp_path / "frames")
-    assert not (tmp_path / "frames").exists()
-    with pytest.raises(InputError, match="--every: expected at least 1, got 0"):
-        video.extract_frames(film_file, tmp_path / "frames", 0)
-
-
-def test_the_sharpest_frame_stands_for_its_interval(monkeypatch, tmp_path, film_file):
-    written = []
-    monkeypatch.setattr(cv2, "VideoCapture", lambda name: Film(12, 4))
-    monkeypatch.setattr(cv2, "imwrite", lambda name, frame, options: written.append(int(frame.max())))
-    assert video.extract_frames(film_file, tmp_path / "frames", 4) == 3
-    assert written == [135] * 3
