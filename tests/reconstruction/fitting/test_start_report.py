@@ -93,18 +93,17 @@ def test_edges_of_the_image_are_in_view(point, radius, seen):
     assert in_view(camera, torch.tensor([point]), radii).tolist() == [seen]
 
 
-# Points where photographs agree.
+# Surfaces where photographs agree.
 
 
 @pytest.fixture
 def maps(monkeypatch):
-    """Two photographs, half and a quarter of whose pixels agree with others; a point is its number, thrice."""
-    found, number = [], 0
-    for known in (np.arange(1200) % 2 == 0, np.arange(1200) % 4 == 0):
-        points = np.repeat(number + np.arange(1200.0)[:, None], 3, axis=1)
-        colors = (points / 4800).astype(np.float32).reshape(30, 40, 3)
-        found.append(SimpleNamespace(known=known.reshape(30, 40), points=points, colors=colors))
-        number += 2400
+    """Two photographs of a wall, half and a quarter of whose pixels agree with others."""
+    found = []
+    for photograph, known in zip(PAIR, (np.arange(1200) % 2 == 0, np.arange(1200) % 4 == 0), strict=True):
+        colors = np.random.default_rng(0).random((30, 40, 3)).astype(np.float32)
+        depth = np.full((30, 40), 2.0, np.float32)
+        found.append(SimpleNamespace(camera=photograph.camera, known=known.reshape(30, 40), depth=depth, colors=colors))
     given = []
 
     def estimate(images, cameras, extent, progress):
@@ -118,42 +117,33 @@ def maps(monkeypatch):
 PAIR = [black(0.0, shade=51), black(1.0, shade=102)]
 
 
-def test_points_are_drawn_where_photographs_agree(maps, caplog):
+def test_depth_is_looked_for_in_all_photographs(maps, caplog):
     with caplog.at_level(logging.INFO, "sgwarp"):
-        positions, colors, size = initial.random_points(PAIR, FitSettings(cap=700), len)
+        found = initial.gaussians_from_photographs(PAIR, FitSettings(cap=700), 1.0, len)
     assert "start: the photographs agree on the depth of 38 % of their pixels" in caplog.text  # of three eighths
     ((images, cameras, extent, progress),) = maps
     assert [float(image.max()) for image in images] == pytest.approx([0.2, 0.4])
     assert (cameras, extent, progress) == ([photograph.camera for photograph in PAIR], 1.0, len)
-    numbers = positions[:, 0].long()
-    assert (len(positions), size) == (700, 1.0)
-    assert (numbers.diff() > 0).all()  # each once, in their order
-    assert (numbers[numbers < 1200] % 2 == 0).all()
-    assert (numbers[numbers >= 2400] % 4 == 0).all()
-    assert 0.25 < (numbers >= 2400).float().mean() < 0.42
-    torch.testing.assert_close(colors, (positions / 4800).float())
+    assert 300 < len(found) <= 700
 
 
 def test_what_a_mask_hides_starts_nothing(maps):
     mask = torch.zeros(30, 40, dtype=torch.uint8)
     mask[:20] = 1
     masked = [Photograph(p.stem, p.camera, p.stored, mask) for p in PAIR]
-    positions, _, _ = initial.random_points(masked, FitSettings())
-    assert positions[:, 0].tolist() == [*range(0, 800, 2), *range(2400, 3200, 4)]
+    whole, part = (initial.gaussians_from_photographs(group, FitSettings(), 1.0) for group in (PAIR, masked))
+    edge = 2.0 * (20 - PAIR[0].camera.K[1, 2].item()) / PAIR[0].camera.K[1, 1].item()  # of what the masks leave
+    assert whole.means[:, 1].max() > edge
+    assert part.means[:, 1].max() < edge
 
 
-@pytest.mark.parametrize("name", ["random", "more", "cap", "anywhere"])
-def test_the_seed_alone_decides_which_points_are_drawn(maps, name):
+@pytest.mark.parametrize("name", ["cap", "anywhere"])
+def test_the_seed_alone_decides_which_points_are_drawn(name):
     def drawn(seed: int, around: int) -> torch.Tensor:
         torch.manual_seed(around)  # of whoever else draws
         settings = FitSettings(cap=800, seed=seed)
-        if name == "random":
-            return initial.random_points(PAIR, settings)[0]
         if name == "anywhere":
             return initial._points_anywhere(PAIR, 50, torch.Generator().manual_seed(seed))[0]
-        if name == "more":
-            few = torch.zeros(10, 3, dtype=torch.float64), np.zeros((10, 3))
-            return initial.completed(*few, PAIR, settings, len)[0]
         points = torch.arange(3000.0).reshape(1000, 3)
         return initial.gaussians_from_points(points, points / 3000, settings, 1.0).means
 
@@ -161,15 +151,13 @@ def test_the_seed_alone_decides_which_points_are_drawn(maps, name):
     assert not torch.equal(drawn(5, 0), drawn(6, 0))
 
 
-def test_few_points_stay_and_others_are_added(maps, caplog):
+def test_how_many_are_added_to_few_points_is_said(maps, caplog):
     own, colors = torch.full((10, 3), -1.0, dtype=torch.float64), np.full((10, 3), 0.5)
     with caplog.at_level(logging.INFO, "sgwarp"):
-        positions, colors = initial.completed(own, colors, PAIR, FitSettings(cap=300), len)
-    assert "start: 10 points are few; 290 are added where photographs agree" in caplog.text
-    assert (len(positions), colors.dtype) == (300, torch.float32)
-    assert (positions[:10] == -1).all()
-    assert (colors[:10] == 0.5).all()
-    torch.testing.assert_close(colors[10:], (positions[10:] / 4800).float())
+        found = initial.completed(own, colors, PAIR, FitSettings(cap=300), 1.0, len)
+    assert f"start: 10 points are few; {len(found) - 10} are added where photographs agree" in caplog.text
+    assert 100 < len(found) <= 300
+    assert (found.means[:10] == -1).all()
 
 
 @pytest.mark.parametrize("shape", [(12,), (4, 3, 1), (4, 2), (3, 4)])
