@@ -83,6 +83,21 @@ def test_an_interruption_ends_a_run_before_its_next_step(boards):
     assert run.step == 4
 
 
+@pytest.mark.parametrize("masked", [False, True])
+def test_a_step_that_shows_nothing_moves_no_pose(boards, masked):
+    """All Gaussians lie behind the cameras; where all pixels are masked as well, no exposure moves either."""
+    photographs = read_photographs(boards.views[:3])
+    if masked:
+        nothing = torch.zeros(photographs[0].camera.size, dtype=torch.uint8)
+        photographs = [replace(photograph, stored_mask=nothing) for photograph in photographs]
+    run = loop.Loop(replace(SHORT, exposure=True, refine_poses=True), photographs, [], 1.0, CPU, RunLog())
+    run.begin(replace(scene(), means=scene().means - torch.tensor([0.0, 0.0, 50.0])))
+    assert run.go(lambda *call: None, None, 1000, lambda: False)
+    assert not run.poses.group.parameters.any()
+    if masked:
+        torch.testing.assert_close(run.exposure.group.parameters, torch.eye(3, 4).expand(3, 3, 4))
+
+
 POINTS = (np.random.default_rng(0).random((900, 3)), np.zeros((900, 3)))
 
 
