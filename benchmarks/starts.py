@@ -1,6 +1,6 @@
 """What a fit starts from, and what that is worth: the room with points, without, and without poses.
 
-    SGWARP_DATA=FOLDER python -m benchmarks.starts [START ...] [--steps 1500] [--cap 30000] [--downscale 2] [--repeats 1]
+    SGWARP_DATA=FOLDER python -m benchmarks.starts [START ...] [--steps N] [--cap N] [--downscale N] [--repeats N]
 
 Each start is fitted and added to benchmarks/starts.json: PSNR of the held-out views, the gap to the fitted ones, mIoU
 of true labels lifted into the scene, and seconds. `photographs` finds the poses as well, those of held-out views too,

@@ -248,3 +248,22 @@ def test_a_batch_refuses_values_without_sense(stage_files, tmp_path, capsys, opt
 def test_values_at_the_end_of_their_range_are_taken(tmp_path):
     Batch(scenes="s", do="lift", out=tmp_path, workers=1, threads=1, time_limit=1e-3, memory_limit=1e-3)._check()
     Batch(scenes="s", do="lift", out=tmp_path, engine="ray", address="x:1", gpus=0.5)._check()
+
+
+def test_features_of_gaussians_are_taken_as_they_are(stage, stage_files, tmp_path, monkeypatch, caplog):
+    """Nothing is lifted, and what is said about lifting is without effect."""
+    (kind,) = [kind for kind in KINDS.values() if kind.fused][:1]
+    semantics, asked = lift(stage_files.gaussians, stage.views[:1], stage.dense), []
+
+    def builder(name):
+        return lambda argument, gaussians, space: asked.append((name, argument, len(gaussians), space)) or semantics
+
+    monkeypatch.setattr("sgwarp.encoders.building.builder", builder)
+    out = tmp_path / "s.safetensors"
+    words = ["lift", stage_files.scene, "--views", "none", "--encoder", f"{kind.name}:F.pt?space=clip", "--out", out]
+    assert run(*words, "--mode", "center") == 0
+    assert asked == [(kind.fused, "F.pt", len(stage_files.gaussians), "clip")]
+    assert f"--mode has no effect: {kind.name}:F.pt?space=clip holds features of Gaussians" in caplog.text
+    assert read_notes(out)["encoder"] == f"{kind.name}:F.pt?space=clip"
+    assert "views" not in read_notes(out)
+    assert record(tmp_path)["error"] == {"coverage": pytest.approx(semantics.coverage)}

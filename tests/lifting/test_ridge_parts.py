@@ -245,3 +245,15 @@ def test_nothing_is_filled_where_nothing_lacks_or_nothing_was_seen(stage):
     for weight in (torch.ones(n), torch.zeros(n)):
         semantics = Semantics(torch.ones(n, 2) * weight[:, None], weight, weight, "t", stage.gaussians.fingerprint)
         assert fill_holes(stage.gaussians, semantics) is semantics
+
+
+def test_every_product_tells_which_views_are_done(stage):
+    done, views = [], stage.views[:2]
+    reader = MapReader(stage.gaussians, as_source(stage.dense), RasterSettings(), RunLog())
+    problem = Problem(reader, views, {}, done=done.append)
+    features = torch.zeros(len(stage.gaussians), 5)
+    for walk in (problem.diagonal, lambda: problem.normal_product(features)):
+        walk()
+        assert done == [view.stem for view in views]
+        done.clear()
+    assert reader.log.stages["solve"] > 0

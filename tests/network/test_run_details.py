@@ -8,6 +8,7 @@ import pytest
 import torch
 
 from sgwarp.errors import InputError
+from sgwarp.network.layers.sparse import pool
 from sgwarp.network.prediction import Prediction
 from sgwarp.network.quality import ProjectionQuality, filled, projection_quality
 from sgwarp.network.training import processes as sharing
@@ -17,6 +18,7 @@ from sgwarp.network.training.data import TrainingScene
 from sgwarp.network.training.processes import Processes, joined
 from sgwarp.network.training.settings import DistillSettings
 from sgwarp.network.training.trainer import _identity, _Run, distill
+from sgwarp.ops.sparse.voxels import pack_voxels
 from sgwarp.runs.log import RunLog
 from sgwarp.scene import Semantics
 
@@ -259,3 +261,63 @@ def test_predictions_fill_what_no_view_saw_with_the_usual_weight():
     assert found.weight.tolist() == [3.0, 1.0, 3.0, 8.0, 0.0]
     empty = Semantics(torch.zeros(5, 2), torch.zeros(5), torch.zeros(5), "t", "0" * 16)
     assert filled(empty, predicted).weight.tolist() == known.tolist()
+
+
+# What a run is known by
+
+
+def test_random_numbers_depend_on_every_number_and_its_place():
+    numbers = [(), (0,), (0, 0), (1,), (0, 1), (1, 0), (0, 0, 1), (2**40, 3), (3, 2**40)]
+    first = [torch.rand((), generator=trainer._generator(*given), dtype=torch.float64).item() for given in numbers]
+    assert len(set(first)) == len(numbers)
+    again = [torch.rand((), generator=trainer._generator(*given), dtype=torch.float64).item() for given in numbers]
+    assert first == again
+
+
+@pytest.mark.parametrize("name", ["net", "net.v2"])
+def test_the_state_lies_beside_its_network(tmp_path, name):
+    out = tmp_path / f"{name}.safetensors"
+    assert trainer.state_path(out) == trainer.state_path(str(out)) == tmp_path / f"{name}.state.pt"
+
+
+@pytest.mark.slow
+def test_a_state_goes_on_with_the_same_run_alone(tmp_path):
+    def run(settings=SETTINGS, kind=("t", 4, None), data="scenes") -> _Run:
+        made = _Run(settings, kind, None, Processes(), torch.device("cpu"), RunLog())
+        made.data = data
+        return made
+
+    path, first = tmp_path / "net.state.pt", run()
+    first.history = [trainer.Epoch(1, 0.1, 0.5, 2.0)]
+    first.save(path)
+    second = run()
+    with torch.no_grad():
+        second.network.net.final.kernel.zero_()
+    second.restore(path)
+    assert second.history == first.history
+    assert torch.equal(second.network.net.final.kernel, first.network.net.final.kernel)
+    assert second.log.left_out == {"epochs_done_before": 1}
+    others = {
+        "epochs": run(replace(SETTINGS, epochs=4)),
+        "seed": run(replace(SETTINGS, seed=1)),
+        "augment": run(replace(SETTINGS, augment=None)),
+        "space": run(kind=("other", 4, None)),
+        "labels": run(kind=("t", 4, ("a", "b", "c", "d"))),
+        "scenes": run(data="others"),
+    }
+    for name, other in others.items():
+        with pytest.raises(InputError, match=rf"net\.state\.pt: is of a run with another {name} \("):
+            other.restore(path)
+
+
+@pytest.mark.slow
+def test_batches_are_counted_in_training_alone():
+    run = _Run(SETTINGS, ("t", 4, None), None, Processes(), torch.device("cpu"), RunLog())
+    net = run.network.net
+    counts = [module.num_batches_tracked for module in net.modules() if isinstance(module, torch.nn.BatchNorm1d)]
+    places = torch.randint(0, 9, (40, 4), generator=torch.Generator().manual_seed(0)) * torch.tensor([0, 1, 1, 1])
+    voxels = pool(pack_voxels(places), torch.ones(40, 3))[0]
+    for training, expected in ((True, 1), (True, 2), (False, 2)):
+        net.train(training)
+        net(voxels)
+        assert {int(count) for count in counts} == {expected}
