@@ -207,6 +207,13 @@ def test_its_folder_is_made_with_all_above_it(tmp_path, view, image):
     CachedMaps(Source(), tmp_path / "over" / "there")
 
 
+def test_phrases_go_to_the_source(tmp_path):
+    assert CachedMaps(Source(), tmp_path).encode_text(["a", "b"]).tolist() == [[1.0] * 8] * 2
+    mute = SimpleNamespace(space="mute", needs_image=True)
+    with pytest.raises(InputError, match="space 'mute' has no text side here"):
+        CachedMaps(mute, tmp_path).encode_text(["a"])
+
+
 def test_sources_without_a_key_are_always_asked(tmp_path, view, image):
     source = Source(key=None)
     cached = CachedMaps(source, tmp_path)

@@ -167,7 +167,9 @@ def read_bilinearly(features, size):
 @pytest.mark.parametrize("rest", ["none", "cells", "own"])
 def test_pixel_level(view, image, rest):
     """Each mask takes the mean of what the network saw, not of what larger masks painted; smaller ones lie on top."""
-    found = RefinedPixels(Toy(), Shapes(), rest).encode(view, image)
+    source = RefinedPixels(Toy(), Shapes(), rest)
+    found = source.encode(view, image)
+    assert torch.equal(source.encode_text(["cat"]), Toy().encode_text(["cat"]))
     size = (HEIGHT // 2, WIDTH // 2)
     features = Toy().encode_pixels(image)
     large = read_bilinearly(features, size)

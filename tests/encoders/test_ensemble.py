@@ -159,13 +159,14 @@ def test_dense_maps_of_two_sizes():
 
 @pytest.mark.parametrize("kind", ["ids", "dense"])
 @pytest.mark.parametrize("order", [1, -1])
-def test_the_map_with_the_most_pixels_gives_the_size(kind, order):
-    """Not the one with the most rows."""
+@pytest.mark.parametrize(("large", "small"), [((4, 40), (5, 8)), ((40, 4), (8, 5)), ((30, 10), (4, 40))])
+def test_the_map_with_the_most_pixels_gives_the_size(kind, order, large, small):
+    """Not the one with the most rows or columns."""
     maps = []
-    for size in ((4, 40), (5, 8))[::order]:
+    for size in (large, small)[::order]:
         parts = {"ids": ids(size, 3, 0), "vectors": unit(3, 4)} if kind == "ids" else {"dense": unit(*size, 4)}
         maps.append(FeatureMap("one", **parts))
-    assert join_maps("both", maps, (0.5, 0.5)).size == (4, 40)
+    assert join_maps("both", maps, (0.5, 0.5)).size == large
 
 
 @pytest.mark.parametrize("needed", [(True, True), (True, False), (False, True), (False, False)])

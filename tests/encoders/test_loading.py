@@ -1,6 +1,7 @@
 """What keeps a network from being loaded is said in one line, wherever in its loading it shows."""
 
 import json
+import sys
 from types import SimpleNamespace
 
 import pytest
@@ -113,6 +114,62 @@ def test_ways_of_resizing(tmp_path, resample, way):
         assert small[0, 0].tolist() == [[1, 0], [0, 1]]
     else:
         assert 0 < small[0, 0, 0, 0] < 1  # antialiased
+
+
+@pytest.mark.parametrize("shown", [True, False])
+def test_the_librarys_bar_is_as_it_was_afterwards(shown):
+    logging = pytest.importorskip("transformers").utils.logging
+    before = logging.is_progress_bar_enabled()
+    try:
+        (logging.enable_progress_bar if shown else logging.disable_progress_bar)()
+        with weights.no_progress_bar():
+            assert not logging.is_progress_bar_enabled()
+        assert logging.is_progress_bar_enabled() == shown
+    finally:
+        (logging.enable_progress_bar if before else logging.disable_progress_bar)()
+
+
+def test_values_are_normalised_channel_by_channel():
+    found = Preparation((0.5, 0.0, 1.0), (0.5, 2.0, 1.0)).normalise(torch.full((1, 3, 1, 1), 0.75))
+    assert found.flatten().tolist() == [0.5, 0.375, -0.25]
+    images = torch.rand(1, 3, 4, 6)
+    assert Preparation().resize(images, 4, 6) is images
+
+
+def test_preparations_need_their_package(tmp_path, monkeypatch):
+    monkeypatch.setitem(sys.modules, "transformers", None)
+    with pytest.raises(InputError, match=r'encoder x needs the package transformers: pip install "sgwarp\[models\]"'):
+        Preparation.load(str(tmp_path), "encoder x")
+
+
+@pytest.mark.parametrize("path", ["/nowhere/at/all", "./nowhere", "../nowhere", "~/nowhere"])
+def test_paths_of_folders_are_no_names_on_the_hub(monkeypatch, path):
+    monkeypatch.setattr(weights, "require", lambda *given: SimpleNamespace(AutoConfig=None))
+    with pytest.raises(InputError, match=f"^clip: {path}: no such folder"):
+        load_config(path, "clip", ("clip",))
+
+
+@pytest.mark.parametrize(
+    ("missing", "wrong", "message"),
+    [
+        (("d", "b", "c", "a"), (), "lacks 4 weights of Net, such as a, b, c$"),
+        (("b",), ("a",), "lacks 2 weights of Net, such as b, a$"),
+        ((), (), ""),
+    ],
+)
+def test_a_loaded_model_is_complete_and_asked_only(monkeypatch, missing, wrong, message):
+    asked, net = [], torch.nn.Sequential(torch.nn.Linear(2, 2), torch.nn.Dropout())
+    info = {"missing_keys": set(missing), "mismatched_keys": set(wrong)}
+    kind = SimpleNamespace(from_pretrained=lambda path, **options: asked.append((path, options)) or (net, info))
+    monkeypatch.setattr(weights, "require", lambda *given: SimpleNamespace(Net=kind))
+    if message:
+        with pytest.raises(InputError, match=message):
+            load_model("Net", "p", "clip", "cpu")
+        return
+    assert load_model("Net", "p", "clip", "cpu") is net
+    assert not net.training
+    assert not any(parameter.requires_grad for parameter in net.parameters())
+    assert asked == [("p", {"output_loading_info": True, "dtype": torch.float32})]
 
 
 def test_sizes_of_inputs():

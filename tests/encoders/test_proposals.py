@@ -87,11 +87,14 @@ def test_boxes_are_painted_from_the_largest_to_the_smallest(selective):
 
 
 def test_of_boxes_of_one_area_the_later_lies_on_top(selective):
-    places = np.random.default_rng(0).integers(0, 80, (40, 2))
+    places = np.random.default_rng(0).integers(0, 80, (60, 2))
+    boxes = [[x, y, side, side] for (x, y), side in zip(places, [8, 12] * 30, strict=True)]
     wanted = np.zeros((96, 128), int)
-    for number, (x, y) in enumerate(places, start=1):
-        wanted[y : y + 12, x : x + 12] = number
-    found = selective([[x, y, 12, 12] for x, y in places], 8.0)
+    for wanted_side in (12, 8):
+        for number, (x, y, side, _) in enumerate(boxes, start=1):
+            if side == wanted_side:
+                wanted[y : y + side, x : x + side] = number
+    found = selective(boxes, 8.0)
     assert same_partition(found, wanted)
     assert found.max() + 1 == len(np.unique(found))
 

@@ -97,7 +97,7 @@ class MappedMasks:
             present = ids.unique()
             present = present[present >= 0]
             masks.append(ids == present[:, None, None])
-            ranks += [level - 1 if len(found.ids) > 1 else UNRANKED] * len(present)
+            ranks += [level - 1] * len(present)  # of the first level: UNRANKED
             names += [found.labels[k] for k in present.tolist()] if found.labels is not None else []
         return ViewMasks.without_empty(torch.cat(masks), torch.tensor(ranks, dtype=torch.int64), tuple(names))
 
