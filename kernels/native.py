@@ -123,6 +123,38 @@ HELPERS = """
 """
 
 
+def _shuffled(vectors: list[str], lanes: list[tuple[int, int]]) -> str:
+    """C++ that picks lane i of the result from (vector, lane) number i, one shuffle of two vectors after the other."""
+    result = vectors[0]
+    for step in range(1, len(vectors)):
+        kept = [lane if step == 1 else i for i, (_, lane) in enumerate(lanes)]
+        taken = [16 + lane if vector == step else kept[i] for i, (vector, lane) in enumerate(lanes)]
+        result = f"__builtin_shufflevector({result}, {vectors[step]}, {', '.join(map(str, taken))})"
+    return result
+
+
+def columns(*widths: int) -> str:
+    """C++ between 16 consecutive structures of some floats each and vectors of one float of all of them.
+
+    Defines `split_W(from, to)`, which reads 16 W floats and writes W vectors, and `join_W(from, to)`, the way back.
+    """
+    code = ""
+    for width in widths:
+        memory, vectors = ([f"{name}{k}" for k in range(width)] for name in "mv")
+        split = [_shuffled(memory, [divmod(width * i + k, 16) for i in range(16)]) for k in range(width)]
+        join = [_shuffled(vectors, [divmod(16 * k + i, width)[::-1] for i in range(16)]) for k in range(width)]
+        for name, given, made, source, target in (
+            ("split", memory, split, "const float* from, Row* to", "to[{}]"),
+            ("join", vectors, join, "const Row* from, float* to", "reinterpret_cast<Row*>(to)[{}]"),
+        ):
+            read = "reinterpret_cast<const Row*>(from)[{}]" if name == "split" else "from[{}]"
+            code += f"    const auto {name}_{width} = []({source}) {{\n"
+            code += "".join(f"        const Row {x} = {read.format(k)};\n" for k, x in enumerate(given))
+            code += "".join(f"        {target.format(k)} = {x};\n" for k, x in enumerate(made))
+            code += "    };\n"
+    return code
+
+
 def snippet(body: str, **constants: bool | int | float) -> str:
     """The C++ of a loop. Its options come first as `constexpr`; what they switch off the compiler removes."""
     shared = {"LEVEL_SLACK": float(LEVEL_SLACK), "BATCH": int(BATCH)}

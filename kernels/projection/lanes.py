@@ -7,7 +7,7 @@ compare them splat by splat. Comparisons are exact about NaN and infinity, as th
 import warp as wp
 
 from sgwarp.kernels.gaussian import EXACT_OPTIONS, LOG2_E, MIN_QUAT_NORM2, UNIT, Pinhole, Splat
-from sgwarp.kernels.native import snippet
+from sgwarp.kernels.native import columns, snippet
 from sgwarp.kernels.projection.backward import LN_2, SEEN
 from sgwarp.kernels.projection.forward import (
     DEGENERATE,
@@ -23,21 +23,28 @@ wp.set_module_options(EXACT_OPTIONS)
 
 GROUP = 16  # Gaussians of a kernel thread
 
-# Columns of 16 Gaussians, and back; what lies beyond the last repeats it.
-COLUMNS = """
+# Columns of 16 Gaussians; what lies beyond the last repeats it.
+COLUMNS = (
+    columns(1, 2, 3, 4)
+    + """
     const int first = group * 16, count = means.shape[0] - first < 16 ? means.shape[0] - first : 16;
-    const auto columns = [&](const float* from, int width, Row* to) {
+    const auto read = [&](const auto& split, const auto& array, int width, Row* to) {
+        const float* const from = reinterpret_cast<const float*>(array.data + first);
+        if (count == 16) return split(from, to);
+        float padded[64];
         for (int i = 0; i < 16; ++i)
-            for (int j = 0; j < width; ++j) to[j][i] = from[(i < count ? i : count - 1) * width + j];
+            for (int j = 0; j < width; ++j) padded[i * width + j] = from[(i < count ? i : count - 1) * width + j];
+        split(padded, to);
     };
     Row mean[3], quat[4], scale[3], given[1];
-    columns(reinterpret_cast<const float*>(means.data + first), 3, mean);
-    columns(reinterpret_cast<const float*>(quats.data + first), 4, quat);
-    columns(reinterpret_cast<const float*>(scales.data + first), 3, scale);
-    columns(opacities.data + first, 1, given);
+    read(split_3, means, 3, mean);
+    read(split_4, quats, 4, quat);
+    read(split_3, scales, 3, scale);
+    read(split_1, opacities, 1, given);
     const auto root = [](Row x) -> Row { return __builtin_elementwise_sqrt(x); };
     const auto& view = camera.rotation.data;
 """
+)
 
 # The centre seen from the camera: `away` in the world's axes, `point` in the camera's.
 POINT = """
@@ -97,6 +104,12 @@ PROJECT = (
     // Why each is left out: the first reason that holds.
     const Ints visible = VISIBLE;
     Ints status = visible;
+    const auto write_status = [&] {
+        typedef wp::uint8 Bytes __attribute__((ext_vector_type(16), aligned(1)));
+        const Bytes bytes = __builtin_convertvector(status, Bytes);
+        if (count == 16) *reinterpret_cast<Bytes*>(status_out.data + first) = bytes;
+        else for (int i = 0; i < count; ++i) status_out.data[first + i] = bytes[i];
+    };
     const auto leave_out = [&](Ints holds, int reason) {
         const Ints code = reason;
         status = (status == visible) & holds ? code : status;
@@ -109,10 +122,7 @@ PROJECT = (
 
     POINT
     leave_out(~((point[2] > camera.near) & (point[2] < camera.far)), OUTSIDE_DEPTH);
-    if (!bits(status == visible)) {
-        for (int i = 0; i < count; ++i) status_out.data[first + i] = status[i];
-        return;
-    }
+    if (!bits(status == visible)) return write_status();
 
     JACOBIAN
     const Row x = camera.focal[0] * slope[0] + camera.principal[0];
@@ -147,8 +157,9 @@ PROJECT = (
     leave_out(~((x + half_width >= 0.5f) & (x - half_width <= width - 0.5f) & (y + half_height >= 0.5f)
               & (y - half_height <= height - 0.5f)), OFF_SCREEN);
 
-    for (int i = 0; i < count; ++i) status_out.data[first + i] = status[i];
-    for (int i = 0; i < count; ++i) depths_out.data[first + i] = point[2][i];
+    write_status();
+    if (count == 16) *reinterpret_cast<Row*>(depths_out.data + first) = point[2];
+    else for (int i = 0; i < count; ++i) depths_out.data[first + i] = point[2][i];
     Row lines[16] = {x, y, a, b, c, level, point[2], half_width, half_height, reach, summit, inv_bc};
     transpose(lines);
     for (unsigned left = bits(status == visible) & ((1u << count) - 1); left; left &= left - 1) {
@@ -169,11 +180,14 @@ BACKWARD = (
     for (int i = 0; i < 16; ++i) moments[i] = rows[i < count ? i : count - 1];
     transpose(moments);
     const Ints seen = moments[SEEN] != zero;
-    const auto write = [&](float* to, int width, const Row* from) {
-        for (int j = 0; j < width; ++j) {
-            const Row kept = seen ? from[j] : zero;
-            for (int i = 0; i < count; ++i) to[i * width + j] = kept[i];
-        }
+    const auto write = [&](const auto& join, const auto& array, int width, const Row* from) {
+        Row kept[4];
+        for (int j = 0; j < width; ++j) kept[j] = seen ? from[j] : zero;
+        float* const to = reinterpret_cast<float*>(array.data + first);
+        if (count == 16) return join(kept, to);
+        float padded[64];
+        join(kept, padded);
+        for (int i = 0; i < count * width; ++i) to[i] = padded[i];
     };
     POINT
     JACOBIAN
@@ -241,11 +255,11 @@ BACKWARD = (
     const Row radial = qw * v_quat[0] + ux * v_quat[1] + uy * v_quat[2] + uz * v_quat[3];
     for (int j = 0; j < 4; ++j) v_quat[j] = (v_quat[j] - unit[j] * radial) * inv_length;
     const Row v_opacity = moments[0] / given[0];
-    write(reinterpret_cast<float*>(means_out.data + first), 3, v_mean);
-    write(reinterpret_cast<float*>(quats_out.data + first), 4, v_quat);
-    write(reinterpret_cast<float*>(scales_out.data + first), 3, v_scale);
-    write(opacities_out.data + first, 1, &v_opacity);
-    write(reinterpret_cast<float*>(means2d_out.data + first), 2, v_pixel);
+    write(join_3, means_out, 3, v_mean);
+    write(join_4, quats_out, 4, v_quat);
+    write(join_3, scales_out, 3, v_scale);
+    write(join_1, opacities_out, 1, &v_opacity);
+    write(join_2, means2d_out, 2, v_pixel);
     if (poses_out.shape[0] > 0) {
         Row pose[12];
         for (int r = 0; r < 3; ++r) {
@@ -254,7 +268,10 @@ BACKWARD = (
                                 + v_axes[r][2] * R[j][2];
             pose[9 + r] = v_point[r];
         }
-        write(poses_out.data + first * 12, 12, pose);
+        for (int j = 0; j < 12; ++j) {
+            const Row kept = seen ? pose[j] : zero;
+            for (int i = 0; i < count; ++i) poses_out.data[(first + i) * 12 + j] = kept[i];
+        }
     }
 """.replace("    POINT\n", POINT)
     .replace("    JACOBIAN\n", JACOBIAN)
