@@ -72,6 +72,7 @@ HELPERS = """
     };
     // Rows and columns of 16 x 16 values change places: squares of 8, 4, 2 and 1 across the diagonal.
 #define EXCHANGE(step, low, high)                                    \\
+    _Pragma("clang loop unroll(full)")                               \\
     for (int i = 0; i < 16; ++i)                                     \\
         if (!(i & step)) {                                           \\
             const Row a = square[i], b = square[i + step];           \\
@@ -155,9 +156,23 @@ def columns(*widths: int) -> str:
     return code
 
 
+def by_groups(body: str, count: str) -> str:
+    """C++ that runs `body`, which takes 16 of `count` elements from 16 `group` on, for all groups of a thread, `block`.
+
+    Warp copies the arguments of a kernel for each of its threads, and what is copied has to arrive in memory first.
+    """
+    loop = (
+        f"for (int group = GROUPS * block; group < GROUPS * (block + 1) && 16 * group < {count}; ++group) run(group);"
+    )
+    return f"    const auto run = [&](int group) {{\n{body}    }};\n    {loop}\n"
+
+
+GROUP = 64  # Gaussians of a kernel thread, 16 at a time
+
+
 def snippet(body: str, **constants: bool | int | float) -> str:
     """The C++ of a loop. Its options come first as `constexpr`; what they switch off the compiler removes."""
-    shared = {"LEVEL_SLACK": float(LEVEL_SLACK), "BATCH": int(BATCH)}
+    shared = {"LEVEL_SLACK": float(LEVEL_SLACK), "BATCH": int(BATCH), "GROUPS": GROUP // 16}
     return "".join(_declaration(name, value) for name, value in {**shared, **constants}.items()) + HELPERS + body
 
 

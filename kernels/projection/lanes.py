@@ -7,7 +7,7 @@ compare them splat by splat. Comparisons are exact about NaN and infinity, as th
 import warp as wp
 
 from sgwarp.kernels.gaussian import EXACT_OPTIONS, LOG2_E, MIN_QUAT_NORM2, UNIT, Pinhole, Splat
-from sgwarp.kernels.native import columns, snippet
+from sgwarp.kernels.native import by_groups, columns, snippet
 from sgwarp.kernels.projection.backward import LN_2, SEEN
 from sgwarp.kernels.projection.forward import (
     DEGENERATE,
@@ -21,12 +21,8 @@ from sgwarp.kernels.projection.forward import (
 
 wp.set_module_options(EXACT_OPTIONS)
 
-GROUP = 16  # Gaussians of a kernel thread
-
 # Columns of 16 Gaussians; what lies beyond the last repeats it.
-COLUMNS = (
-    columns(1, 2, 3, 4)
-    + """
+COLUMNS = """
     const int first = group * 16, count = means.shape[0] - first < 16 ? means.shape[0] - first : 16;
     const auto read = [&](const auto& split, const auto& array, int width, Row* to) {
         const float* const from = reinterpret_cast<const float*>(array.data + first);
@@ -44,7 +40,6 @@ COLUMNS = (
     const auto root = [](Row x) -> Row { return __builtin_elementwise_sqrt(x); };
     const auto& view = camera.rotation.data;
 """
-)
 
 # The centre seen from the camera: `away` in the world's axes, `point` in the camera's.
 POINT = """
@@ -172,112 +167,6 @@ PROJECT = (
 )
 
 
-BACKWARD = (
-    COLUMNS
-    + """
-    Row moments[16];
-    const Row* const rows = reinterpret_cast<const Row*>(sums.data) + first;
-    for (int i = 0; i < 16; ++i) moments[i] = rows[i < count ? i : count - 1];
-    transpose(moments);
-    const Ints seen = moments[SEEN] != zero;
-    const auto write = [&](const auto& join, const auto& array, int width, const Row* from) {
-        Row kept[4];
-        for (int j = 0; j < width; ++j) kept[j] = seen ? from[j] : zero;
-        float* const to = reinterpret_cast<float*>(array.data + first);
-        if (count == 16) return join(kept, to);
-        float padded[64];
-        join(kept, padded);
-        for (int i = 0; i < count * width; ++i) to[i] = padded[i];
-    };
-    POINT
-    JACOBIAN
-    FACTOR
-    const Row g = LN_2 * moments[0], gu = LN_2 * moments[1], gv = LN_2 * moments[2];
-    const Row guu = LN_2 * moments[3], guv = LN_2 * moments[4], gvv = LN_2 * moments[5];
-    const Row v_pixel[2] = {2.0f * a * gu, 2.0f * (b * gu + c * gv)};
-    // N = L^T M, then L (moments N).
-    Row v_x[3], v_y[3];
-    for (int j = 0; j < 3; ++j) {
-        const Row n_u = a * m_x[j] + b * m_y[j], n_v = c * m_y[j];
-        const Row q_u = (4.0f / LOG2_E) * (guu * n_u + guv * n_v), q_v = (4.0f / LOG2_E) * (guv * n_u + gvv * n_v);
-        v_x[j] = a * q_u, v_y[j] = b * q_u + c * q_v;
-    }
-    if (knobs.antialiased) {
-        // opacity sqrt(sharp / determinant): half the logarithm of both.
-        // A splat seen end on (sharp = 0) has no gradient here, and zero times infinity is NaN.
-        const Row half = 0.5f * moments[0];
-        const Row v_sharp = half == zero ? zero : half * (1.0f / sharp - 1.0f / determinant);
-        const Row v_trace = -half * knobs.dilation / determinant;
-        for (int j = 0; j < 3; ++j) {
-            const int k = (j + 1) % 3, l = (j + 2) % 3;
-            v_x[j] += 2.0f * (v_sharp * (m_y[k] * minors[l] - m_y[l] * minors[k]) + v_trace * m_x[j]);
-            v_y[j] += 2.0f * (v_sharp * (minors[k] * m_x[l] - minors[l] * m_x[k]) + v_trace * m_y[j]);
-        }
-    }
-    Row scaled_x[3], scaled_y[3], v_scale[3], v_axes[3][3];
-    for (int j = 0; j < 3; ++j) {
-        scaled_x[j] = v_x[j] * scale[j], scaled_y[j] = v_y[j] * scale[j];
-        v_scale[j] = v_x[j] * along_x[j] + v_y[j] * along_y[j];
-        v_axes[0][j] = fx * scaled_x[j], v_axes[1][j] = fy * scaled_y[j];
-        v_axes[2][j] = sx * scaled_x[j] + sy * scaled_y[j];
-    }
-    // Of the rows of J; where x/z or y/z is clamped, J does not depend on it.
-    Row row_x[3], row_y[3];
-    for (int i = 0; i < 3; ++i) {
-        row_x[i] = axes[i][0] * scaled_x[0] + axes[i][1] * scaled_x[1] + axes[i][2] * scaled_x[2];
-        row_y[i] = axes[i][0] * scaled_y[0] + axes[i][1] * scaled_y[1] + axes[i][2] * scaled_y[2];
-    }
-    const Row free_x = tangent[0] == slope[0] ? fx * row_x[2] : zero;
-    const Row free_y = tangent[1] == slope[1] ? fy * row_y[2] : zero;
-    const Row v_slope_x = camera.focal[0] * v_pixel[0] - free_x, v_slope_y = camera.focal[1] * v_pixel[1] - free_y;
-    const Row v_inv_z = camera.focal[0] * (row_x[0] - tangent[0] * row_x[2])
-                      + camera.focal[1] * (row_y[1] - tangent[1] * row_y[2]);
-    Row v_point[3] = {v_slope_x * inv_z, v_slope_y * inv_z,
-                      (-slope[0] * v_slope_x - slope[1] * v_slope_y - v_inv_z * inv_z) * inv_z};
-    if (at_depth >= 0) v_point[2] += moments[at_depth];
-    // From the camera's axes to the world's.
-    Row v_mean[3], v[3][3];
-    for (int i = 0; i < 3; ++i) {
-        v_mean[i] = view[0][i] * v_point[0] + view[1][i] * v_point[1] + view[2][i] * v_point[2];
-        for (int j = 0; j < 3; ++j)
-            v[i][j] = view[0][i] * v_axes[0][j] + view[1][i] * v_axes[1][j] + view[2][i] * v_axes[2][j];
-    }
-    // `quaternion_gradient`.
-    const Row inv_length = 1.0f / root(norm2);
-    const Row unit[4] = {quat[0] * inv_length, quat[1] * inv_length, quat[2] * inv_length, quat[3] * inv_length};
-    const Row qw = unit[0], ux = unit[1], uy = unit[2], uz = unit[3];
-    const Row yz = v[2][1] - v[1][2], zx = v[0][2] - v[2][0], xy_ = v[1][0] - v[0][1];
-    const Row s_xy = v[0][1] + v[1][0], s_xz = v[0][2] + v[2][0], s_yz = v[1][2] + v[2][1];
-    Row v_quat[4] = {2.0f * (ux * yz + uy * zx + uz * xy_),
-                     2.0f * (qw * yz + uy * s_xy + uz * s_xz - 2.0f * ux * (v[1][1] + v[2][2])),
-                     2.0f * (qw * zx + ux * s_xy + uz * s_yz - 2.0f * uy * (v[0][0] + v[2][2])),
-                     2.0f * (qw * xy_ + ux * s_xz + uy * s_yz - 2.0f * uz * (v[0][0] + v[1][1]))};
-    const Row radial = qw * v_quat[0] + ux * v_quat[1] + uy * v_quat[2] + uz * v_quat[3];
-    for (int j = 0; j < 4; ++j) v_quat[j] = (v_quat[j] - unit[j] * radial) * inv_length;
-    const Row v_opacity = moments[0] / given[0];
-    write(join_3, means_out, 3, v_mean);
-    write(join_4, quats_out, 4, v_quat);
-    write(join_3, scales_out, 3, v_scale);
-    write(join_1, opacities_out, 1, &v_opacity);
-    write(join_2, means2d_out, 2, v_pixel);
-    if (poses_out.shape[0] > 0) {
-        Row pose[12];
-        for (int r = 0; r < 3; ++r) {
-            for (int j = 0; j < 3; ++j)
-                pose[3 * r + j] = v_point[r] * away[j] + v_axes[r][0] * R[j][0] + v_axes[r][1] * R[j][1]
-                                + v_axes[r][2] * R[j][2];
-            pose[9 + r] = v_point[r];
-        }
-        for (int j = 0; j < 12; ++j) {
-            const Row kept = seen ? pose[j] : zero;
-            for (int i = 0; i < count; ++i) poses_out.data[(first + i) * 12 + j] = kept[i];
-        }
-    }
-""".replace("    POINT\n", POINT)
-    .replace("    JACOBIAN\n", JACOBIAN)
-    .replace("    FACTOR\n", FACTOR)
-)
-
 CONSTANTS = {
     "MIN_NORM2": float(MIN_QUAT_NORM2),
     "UNIT": float(UNIT),
@@ -293,9 +182,9 @@ CONSTANTS = {
 }
 
 
-@wp.func_native(snippet(PROJECT, **CONSTANTS))
+@wp.func_native(snippet(columns(1, 3, 4) + by_groups(PROJECT, "means.shape[0]"), **CONSTANTS))
 def project_group(
-    group: int,
+    block: int,
     means: wp.array[wp.vec3],
     quats: wp.array[wp.vec4],
     scales: wp.array[wp.vec3],
@@ -311,7 +200,7 @@ def project_group(
 @wp.kernel
 def project_groups(
     # In:
-    base: int,  # first group of 16 of this launch
+    base: int,  # first GROUP of this launch
     means: wp.array[wp.vec3],  # [N] centres [m]
     quats: wp.array[wp.vec4],  # [N] rotations (w, x, y, z)
     scales: wp.array[wp.vec3],  # [N] standard deviations [m]
@@ -323,65 +212,5 @@ def project_groups(
     status_out: wp.array[wp.uint8],  # [N] VISIBLE or why not
     depths_out: wp.array[float],  # [N] z in the camera frame [m], where visible
 ):
-    """Project 16 Gaussians (paper eq. 2, 3) and decide whether any pixel can see them."""
+    """Project a few times 16 Gaussians (paper eq. 2, 3) and decide whether any pixel can see them."""
     project_group(base + wp.tid(), means, quats, scales, opacities, camera, knobs, splats_out, status_out, depths_out)
-
-
-@wp.func_native(snippet(BACKWARD, **CONSTANTS))
-def project_group_backward(
-    group: int,
-    means: wp.array[wp.vec3],
-    quats: wp.array[wp.vec4],
-    scales: wp.array[wp.vec3],
-    opacities: wp.array[float],
-    camera: Pinhole,
-    knobs: Knobs,
-    sums: wp.array2d[float],
-    at_depth: int,
-    means_out: wp.array[wp.vec3],
-    quats_out: wp.array[wp.vec4],
-    scales_out: wp.array[wp.vec3],
-    opacities_out: wp.array[float],
-    means2d_out: wp.array[wp.vec2],
-    poses_out: wp.array2d[float],
-): ...
-
-
-@wp.kernel
-def project_groups_backward(
-    # In:
-    base: int,  # first group of 16 of this launch
-    means: wp.array[wp.vec3],  # [N] centres [m]
-    quats: wp.array[wp.vec4],  # [N] rotations (w, x, y, z)
-    scales: wp.array[wp.vec3],  # [N] standard deviations [m]
-    opacities: wp.array[float],  # [N]
-    camera: Pinhole,
-    knobs: Knobs,
-    sums: wp.array2d[float],  # [N, 16] as `project_backward` reads them
-    at_depth: int,  # column of `sums` with the gradient of the depth, -1 = none
-    # Out:
-    means_out: wp.array[wp.vec3],  # [N] zero where no tile was reached, as all that follow
-    quats_out: wp.array[wp.vec4],  # [N]
-    scales_out: wp.array[wp.vec3],  # [N]
-    opacities_out: wp.array[float],  # [N]
-    means2d_out: wp.array[wp.vec2],  # [N] gradient of the projected centres [1 / pixels]
-    poses_out: wp.array2d[float],  # [N, POSE_COLUMNS] each Gaussian's share of the pose's gradient, or empty
-):
-    """Differentiate `project_groups`."""
-    project_group_backward(
-        base + wp.tid(),
-        means,
-        quats,
-        scales,
-        opacities,
-        camera,
-        knobs,
-        sums,
-        at_depth,
-        means_out,
-        quats_out,
-        scales_out,
-        opacities_out,
-        means2d_out,
-        poses_out,
-    )

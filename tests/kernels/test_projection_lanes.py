@@ -4,9 +4,11 @@ import pytest
 import torch
 import warp as wp
 
+from sgwarp.kernels.native import GROUP
 from sgwarp.kernels.projection import backward as projection_backward
 from sgwarp.kernels.projection import forward as projection
 from sgwarp.kernels.projection import lanes as projection_lanes
+from sgwarp.kernels.projection import lanes_backward as projection_lanes_backward
 from sgwarp.ops.launcher import launch, view
 from sgwarp.ops.splatting import tiles
 from sgwarp.ops.splatting.settings import RasterSettings
@@ -71,7 +73,7 @@ def test_splats(case, antialiased):
     scene, settings = cloud(*case), RasterSettings(antialiased=antialiased)
     n = len(scene)
     one, status, depths = project(scene, settings, projection.project_gaussians, n)
-    groups = -(-n // projection_lanes.GROUP)
+    groups = -(-n // GROUP)
     many, status_16, depths_16 = project(scene, settings, projection_lanes.project_groups, groups)
     # At a threshold rounding may decide; it does not here.
     assert torch.equal(status, status_16)
@@ -98,7 +100,7 @@ def test_gradients(case, antialiased, pose, at_depth):
     results = []
     kernels = [
         (projection_backward.project_backward, n),
-        (projection_lanes.project_groups_backward, -(-n // projection_lanes.GROUP)),
+        (projection_lanes_backward.project_groups_backward, -(-n // GROUP)),
     ]
     for kernel, count in kernels:
         shapes = ((n, 3), (n, 4), (n, 3), (n,), (n, 2), (n if pose else 0, projection_backward.POSE_COLUMNS))

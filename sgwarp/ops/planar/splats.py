@@ -136,7 +136,7 @@ class _CompositeSplats(torch.autograd.Function):
         else:
             order = tiles.depth_order(projected)
             colors = _padded(values[order.to(torch.int64)]) if values.shape[1] <= 3 else None
-            lists = tiles.bin_splats(projected, order, colors, camera, places=keep, keep=keep)
+            lists = tiles.bin_splats(projected, order, colors, camera, places=keep, rows=keep, keep=keep)
         job.lists = lists
         if not keep:
             image, transmittance, depth_sum, _ = composite(lists, camera, settings, values, job.wants_depth)
@@ -264,4 +264,9 @@ def _follow(given: ListedSplats, projected: tiles.Projected, values: Tensor, cam
         torch.arange(grid, dtype=torch.int32, device=device), given.offsets.diff(), output_size=n
     )
     offsets = given.offsets.to(torch.int32).contiguous()
-    return tiles.TileLists(order, memory, offsets, listed, entries, places.to(torch.int32), owners[places])
+    row_of = torch.empty_like(listed)
+    row_of[places] = torch.arange(n, dtype=torch.int32, device=device)  # each entry has a row of sums of its own
+    ranges = torch.stack([entries, torch.nn.functional.pad(entries.diff(), (0, 1))], dim=1)
+    return tiles.TileLists(
+        order, memory, offsets, listed, entries, places.to(torch.int32), owners[places], row_of, ranges
+    )
