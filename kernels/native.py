@@ -156,15 +156,21 @@ def columns(*widths: int) -> str:
     return code
 
 
-def by_groups(body: str, count: str) -> str:
-    """C++ that runs `body`, which takes 16 of `count` elements from 16 `group` on, for all groups of a thread, `block`.
+def by_groups(*bodies: str, count: str) -> str:
+    """C++ that runs a body for each `group` of 16 elements that a kernel thread, `block`, takes; then the next body.
 
     Warp copies the arguments of a kernel for each of its threads, and what is copied has to arrive in memory first.
+
+    Args:
+        bodies: They take 16 of the elements, or what there is, from 16 `group` on.
+        count: How many elements there are.
     """
-    loop = (
-        f"for (int group = GROUPS * block; group < GROUPS * (block + 1) && 16 * group < {count}; ++group) run(group);"
-    )
-    return f"    const auto run = [&](int group) {{\n{body}    }};\n    {loop}\n"
+    code = ""
+    for k, body in enumerate(bodies):
+        code += f"    const auto run_{k} = [&](int group) {{\n{body}    }};\n"
+        code += f"    for (int group = GROUPS * block; group < GROUPS * (block + 1) && 16 * group < {count}; ++group)\n"
+        code += f"        run_{k}(group);\n"
+    return code
 
 
 GROUP = 64  # Gaussians of a kernel thread, 16 at a time

@@ -219,7 +219,7 @@ first_pose, second_pose = pose(-62), pose(38, elevation=30)
 # %%
 def project(camera):
     splats, status, depths = wp.zeros(N, dtype=Splat), wp.zeros(N, dtype=wp.uint8), wp.zeros(N, dtype=float)
-    inputs = [0, means, rotations, deviations, opacity, camera, knobs]
+    inputs = [0, means, rotations, deviations, opacity, coefficients, -1, camera, knobs]  # -1: no colours yet
     wp.launch(projection_lanes.project_groups, -(-N // GROUP), inputs, [splats, status, depths])
     return splats, status, depths
 

@@ -7,7 +7,6 @@ own, because the projection reads the same Gaussians: it colours the splats on i
 import warp as wp
 
 from sgwarp.kernels.gaussian import EXACT_OPTIONS, Pinhole
-from sgwarp.kernels.harmonics.forward import BRIGHTEST
 from sgwarp.kernels.native import by_groups, columns, snippet
 from sgwarp.kernels.projection.backward import SEEN
 
@@ -218,10 +217,10 @@ BACKWARD = (
     .replace("    SPREAD\n", SPREAD)
 )
 
-CONSTANTS = {"SEEN": int(SEEN), "BRIGHTEST": float(BRIGHTEST)}
+CONSTANTS = {"SEEN": int(SEEN)}
 
 
-@wp.func_native(snippet(columns(3) + by_groups(BACKWARD, "means.shape[0]"), **CONSTANTS))
+@wp.func_native(snippet(columns(3) + by_groups(BACKWARD, count="means.shape[0]"), **CONSTANTS))
 def shade_group_backward(
     block: int,
     means: wp.array[wp.vec3],

@@ -7,6 +7,8 @@ compare them splat by splat. Comparisons are exact about NaN and infinity, as th
 import warp as wp
 
 from sgwarp.kernels.gaussian import EXACT_OPTIONS, LOG2_E, MIN_QUAT_NORM2, UNIT, Pinhole, Splat
+from sgwarp.kernels.harmonics import lanes as harmonics
+from sgwarp.kernels.harmonics.forward import BRIGHTEST
 from sgwarp.kernels.native import by_groups, columns, snippet
 from sgwarp.kernels.projection.backward import LN_2, SEEN
 from sgwarp.kernels.projection.forward import (
@@ -98,13 +100,9 @@ PROJECT = (
 
     // Why each is left out: the first reason that holds.
     const Ints visible = VISIBLE;
-    Ints status = visible;
-    const auto write_status = [&] {
-        typedef wp::uint8 Bytes __attribute__((ext_vector_type(16), aligned(1)));
-        const Bytes bytes = __builtin_convertvector(status, Bytes);
-        if (count == 16) *reinterpret_cast<Bytes*>(status_out.data + first) = bytes;
-        else for (int i = 0; i < count; ++i) status_out.data[first + i] = bytes[i];
-    };
+    auto& kept = held[group % GROUPS];
+    Ints& status = kept.status;
+    status = visible;
     const auto leave_out = [&](Ints holds, int reason) {
         const Ints code = reason;
         status = (status == visible) & holds ? code : status;
@@ -117,7 +115,7 @@ PROJECT = (
 
     POINT
     leave_out(~((point[2] > camera.near) & (point[2] < camera.far)), OUTSIDE_DEPTH);
-    if (!bits(status == visible)) return write_status();
+    if (!bits(status == visible)) return;
 
     JACOBIAN
     const Row x = camera.focal[0] * slope[0] + camera.principal[0];
@@ -152,22 +150,74 @@ PROJECT = (
     leave_out(~((x + half_width >= 0.5f) & (x - half_width <= width - 0.5f) & (y + half_height >= 0.5f)
               & (y - half_height <= height - 0.5f)), OFF_SCREEN);
 
-    write_status();
-    if (count == 16) *reinterpret_cast<Row*>(depths_out.data + first) = point[2];
-    else for (int i = 0; i < count; ++i) depths_out.data[first + i] = point[2][i];
-    Row lines[16] = {x, y, a, b, c, level, point[2], half_width, half_height, reach, summit, inv_bc};
-    transpose(lines);
-    for (unsigned left = bits(status == visible) & ((1u << count) - 1); left; left &= left - 1) {
-        const int i = __builtin_ctz(left);
-        reinterpret_cast<Row*>(splats_out.data)[first + i] = lines[i];
+    const Row lines[12] = {x, y, a, b, c, level, point[2], half_width, half_height, reach, summit, inv_bc};
+    for (int e = 0; e < 12; ++e) kept.lines[e] = lines[e];
+    for (int j = 0; j < 3; ++j) kept.away[j] = away[j];
+    // Coefficients are fetched while the next groups are projected.
+    const int size = 12 * (degree + 1) * (degree + 1);
+    for (unsigned left = degree < 0 ? 0 : bits(status == visible) & ((1u << count) - 1); left; left &= left - 1) {
+        const auto* const values = sh.data + (long long)(first + __builtin_ctz(left)) * sh.shape[1];
+        for (int byte = 0; byte < size; byte += 64) __builtin_prefetch(reinterpret_cast<const char*>(values) + byte);
     }
 """.replace("    POINT\n", POINT)
     .replace("    JACOBIAN\n", JACOBIAN)
     .replace("    FACTOR\n", FACTOR)
 )
 
+# What the groups of a thread keep until the coefficients have come.
+HELD = """
+    struct Held {
+        Row lines[12], away[3];
+        Ints status;
+    };
+    Held held[GROUPS] __attribute__((aligned(64)));
+"""
+
+# Colours up to `degree`, and the splats. Those whose coefficients are not finite are left out as well.
+FINISH = """
+    const int first = group * 16, count = means.shape[0] - first < 16 ? means.shape[0] - first : 16;
+    auto& kept = held[group % GROUPS];
+    const Ints visible = VISIBLE;
+    Ints status = kept.status;
+    Row lines[16] = {};
+    unsigned left = bits(status == visible) & ((1u << count) - 1);
+    if (degree >= 0 && left) {
+        COEFFICIENTS
+        read_coefficients(left);
+        Row wrong = zero;  // zero times infinity or NaN is NaN
+#pragma clang loop unroll(full)
+        for (int e = 0; e < MOST; ++e)
+            if (e < in_use) wrong += 0.0f * blocks[e / 16][e % 16];
+        const Ints broken = NON_FINITE;
+        status = (status == visible) & ~(wrong == zero) ? broken : status;
+        left &= bits(status == visible);
+        const Row* const away = kept.away;
+        DIRECTION
+        COLOR
+        for (int j = 0; j < 3; ++j) {
+            const Row shown = color[j] > zero ? color[j] : zero;
+            lines[13 + j] = __builtin_elementwise_min(shown, zero + BRIGHTEST);
+        }
+    }
+    typedef wp::uint8 Bytes __attribute__((ext_vector_type(16), aligned(1)));
+    const Bytes bytes = __builtin_convertvector(status, Bytes);
+    if (count == 16) *reinterpret_cast<Bytes*>(status_out.data + first) = bytes;
+    else for (int i = 0; i < count; ++i) status_out.data[first + i] = bytes[i];
+    if (!left) return;
+    for (int e = 0; e < 12; ++e) lines[e] = kept.lines[e];
+    if (count == 16) *reinterpret_cast<Row*>(depths_out.data + first) = lines[6];
+    else for (int i = 0; i < count; ++i) depths_out.data[first + i] = lines[6][i];
+    transpose(lines);
+    for (; left; left &= left - 1) {
+        const int i = __builtin_ctz(left);
+        reinterpret_cast<Row*>(splats_out.data)[first + i] = lines[i];
+    }
+""".replace("        COEFFICIENTS\n", harmonics.COEFFICIENTS)
+FINISH = FINISH.replace("        DIRECTION\n", harmonics.DIRECTION).replace("        COLOR\n", harmonics.COLOR)
+
 
 CONSTANTS = {
+    "BRIGHTEST": float(BRIGHTEST),
     "MIN_NORM2": float(MIN_QUAT_NORM2),
     "UNIT": float(UNIT),
     "LOG2_E": float(LOG2_E),
@@ -182,13 +232,15 @@ CONSTANTS = {
 }
 
 
-@wp.func_native(snippet(columns(1, 3, 4) + by_groups(PROJECT, "means.shape[0]"), **CONSTANTS))
+@wp.func_native(snippet(columns(1, 3, 4) + HELD + by_groups(PROJECT, FINISH, count="means.shape[0]"), **CONSTANTS))
 def project_group(
     block: int,
     means: wp.array[wp.vec3],
     quats: wp.array[wp.vec4],
     scales: wp.array[wp.vec3],
     opacities: wp.array[float],
+    sh: wp.array2d[wp.vec3],
+    degree: int,
     camera: Pinhole,
     knobs: Knobs,
     splats_out: wp.array[Splat],
@@ -205,12 +257,27 @@ def project_groups(
     quats: wp.array[wp.vec4],  # [N] rotations (w, x, y, z)
     scales: wp.array[wp.vec3],  # [N] standard deviations [m]
     opacities: wp.array[float],  # [N]
+    sh: wp.array2d[wp.vec3],  # [N, K] coefficients; or empty
+    degree: int,  # of the colours, -1 = none
     camera: Pinhole,
     knobs: Knobs,
     # Out:
-    splats_out: wp.array[Splat],  # [N] valid where visible
+    splats_out: wp.array[Splat],  # [N] valid where visible, with colours if asked for
     status_out: wp.array[wp.uint8],  # [N] VISIBLE or why not
     depths_out: wp.array[float],  # [N] z in the camera frame [m], where visible
 ):
     """Project a few times 16 Gaussians (paper eq. 2, 3) and decide whether any pixel can see them."""
-    project_group(base + wp.tid(), means, quats, scales, opacities, camera, knobs, splats_out, status_out, depths_out)
+    project_group(
+        base + wp.tid(),
+        means,
+        quats,
+        scales,
+        opacities,
+        sh,
+        degree,
+        camera,
+        knobs,
+        splats_out,
+        status_out,
+        depths_out,
+    )

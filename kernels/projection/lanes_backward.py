@@ -198,8 +198,10 @@ COLOR = (
     .replace("        SPREAD\n", harmonics.SPREAD)
 )
 
-BACKWARD = columns(1, 2, 3, 4) + by_groups(COLUMNS + MOMENTS + WRITE + PROJECTION + WRITE_ALL, "means.shape[0]")
-TOGETHER = columns(1, 2, 3, 4) + by_groups(COLUMNS + GATHER + WRITE + PROJECTION + COLOR + WRITE_ALL, "means.shape[0]")
+BACKWARD = columns(1, 2, 3, 4) + by_groups(COLUMNS + MOMENTS + WRITE + PROJECTION + WRITE_ALL, count="means.shape[0]")
+TOGETHER = columns(1, 2, 3, 4) + by_groups(
+    COLUMNS + GATHER + WRITE + PROJECTION + COLOR + WRITE_ALL, count="means.shape[0]"
+)
 
 
 @wp.func_native(snippet(BACKWARD, **CONSTANTS))

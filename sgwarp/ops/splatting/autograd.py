@@ -249,7 +249,7 @@ class _Rasterize(torch.autograd.Function):
                 backward=True,
                 absolute=request.receives_absgrad is not None,
             )
-        projected = tiles.project(gaussians, camera, settings)
+        projected = tiles.project(gaussians, camera, settings, degree=request.plan.colored, look=False)
         tiles.leave_out_non_finite(projected, features)
         order = tiles.depth_order(projected)
         colors = packed_colors(gaussians, camera, features, order, request.plan)

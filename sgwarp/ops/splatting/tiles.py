@@ -12,7 +12,7 @@ import warp as wp
 from torch import Tensor
 
 from sgwarp.errors import InputError
-from sgwarp.kernels import binning, binning_lanes
+from sgwarp.kernels import binning, binning_lanes, ordering_lanes
 from sgwarp.kernels.gaussian import Pinhole, Splat
 from sgwarp.kernels.harmonics import forward as harmonics
 from sgwarp.kernels.native import GROUP
@@ -152,8 +152,22 @@ def knobs(settings: RasterSettings) -> projection.Knobs:
     return device
 
 
-def project(gaussians: Gaussians, camera: Camera, settings: RasterSettings) -> Projected:
-    """Project every Gaussian."""
+def project(
+    gaussians: Gaussians,
+    camera: Camera,
+    settings: RasterSettings,
+    *,
+    degree: int | None = None,
+    look: bool = True,
+) -> Projected:
+    """Project every Gaussian.
+
+    Args:
+        gaussians, camera, settings: What is seen.
+        degree: On the CPU also evaluate the harmonics of what is visible, up to this degree.
+        look: On the CPU look once per scene whether some coefficient is not finite. Without it only those are looked
+            at that are evaluated: of what is hidden and not finite the status says why it is hidden.
+    """
     n, device = len(gaussians), gaussians.device
     splats = as_splats(splat_memory(n, device, "splats"))
     status = scratch("status", n, torch.uint8, device)
@@ -163,18 +177,19 @@ def project(gaussians: Gaussians, camera: Camera, settings: RasterSettings) -> P
         view(gaussians.quats, wp.vec4),
         view(gaussians.scales, wp.vec3),
         view(gaussians.opacities, wp.float32),
-        pinhole(camera),
-        knobs(settings),
     ]
+    seen_by = [pinhole(camera), knobs(settings)]
     outputs = [splats, view(status, wp.uint8), view(depths, wp.float32)]
     if device.type == "cuda":
-        launch(projection.project_gaussians, n, inputs, outputs, device=device)
-    else:
-        launch(projection_lanes.project_groups, -(-n // GROUP), inputs, outputs, device=device)
-    # The kernel reads geometry and opacity only. On CUDA it is cheaper to look at all than to wait for the answer.
-    if device.type == "cuda":
+        # The kernel reads geometry and opacity only. It is cheaper to look at all colours than to wait for an answer.
+        launch(projection.project_gaussians, n, [*inputs, *seen_by], outputs, device=device)
         mark_non_finite_colors(gaussians.sh, status)
-    elif gaussians.colors_may_be_non_finite:
+        return Projected(splats, status, depths)
+    read = -1 if degree is None else degree
+    inputs += [view(gaussians.sh, wp.vec3), read, *seen_by]
+    launch(projection_lanes.project_groups, -(-n // GROUP), inputs, outputs, device=device)
+    # The kernel left out those whose coefficients it read are not finite. There may be others.
+    if (look or (read + 1) ** 2 < gaussians.sh.shape[1]) and gaussians.colors_may_be_non_finite:
         status.masked_fill_(~gaussians.finite, int(projection.NON_FINITE))
     return Projected(splats, status, depths)
 
@@ -198,14 +213,12 @@ def depth_order(projected: Projected) -> Tensor:
     if device.type == "cuda":
         shown = torch.where(projected.status == projection.VISIBLE, projected.depths, math.inf)
         return shown.argsort(stable=True).to(torch.int32)
-    visible = (projected.status == projection.VISIBLE).nonzero().flatten().to(torch.int32)
-    count = len(visible)
-    keys = scratch("depth keys", 2 * count, torch.float32, device)
-    order = scratch("order", 2 * count, torch.int32, device)
-    torch.index_select(projected.depths, 0, visible, out=keys[:count])
-    order[:count] = visible
-    sort_pairs(keys, order, count, wp.float32)
-    return order[:count]
+    n = len(projected.status)
+    pairs, order = scratch("depth pairs", 2 * n, torch.int64, device), scratch("order", n, torch.int32, device)
+    count = torch.empty(1, dtype=torch.int32, device=device)
+    inputs = [view(projected.status, wp.uint8), view(projected.depths, wp.float32), view(pairs, wp.uint64)]
+    launch(ordering_lanes.sort_depths, 1, inputs, [view(order, wp.int32), view(count, wp.int32)], device=device)
+    return order[: int(count)]
 
 
 def shade(gaussians: Gaussians, camera: Camera, order: Tensor, degree: int) -> Tensor:
