@@ -101,7 +101,8 @@ COUNT = (
                 const int first = ranges.first[i], last = ranges.last[i];
                 if (first > last) continue;
                 int* const of_row = counts + (start + i) * columns;
-                for (int column = first; column <= last; ++column) ++of_row[column];
+#pragma clang loop unroll(disable) vectorize(disable)
+                for (int column = first; column <= last; ++column) ++of_row[column];  // most often one or two
                 entries += last - first + 1;
                 leftmost = least(leftmost, first), rightmost = most(rightmost, last);
             }
@@ -140,19 +141,21 @@ FILL = (
     TILES_OF_A_SPLAT
     + """
     int* const next = cursors.data + slice * cursors.shape[1];
-    const bool keeps_places = places.shape[0] > 0, keeps_tiles = tiles.shape[0] > 0, keeps_rows = row_of.shape[0] > 0;
+    const bool keeps_places = places.shape[0] > 0, keeps_tiles = tiles.shape[0] > 0;
+    const bool keeps_rows = row_places.shape[0] > 0;
     int entry = totals.data[2 * slice], row_of_sums = totals.data[2 * slice + 1];
     for (int k = slice * per_slice; k < end; ++k) {
         const Range rows = {rows_of.data[k] & 0xffff, rows_of.data[k] >> 16};
-        const int across = patches_of.data[k] >> 16, patch_row = rows.first / PATCH;
+        const int left = patches_of.data[k] & 0xffff, across = patches_of.data[k] >> 16, above = rows.first / PATCH;
         const unsigned short* const kept = reinterpret_cast<const unsigned short*>(spans.data + 2 * k);
-        const int rows_here = across * (across ? rows.last / PATCH - patch_row + 1 : 0);
+        const int rows_here = across * (across ? rows.last / PATCH - above + 1 : 0);
         entries.data[k] = entry;
         if (keeps_rows) {
+            row_places.data[2 * k] = row_of_sums - above * across - left;
+            row_places.data[2 * k + 1] = across;
             ranges.data[2 * order.data[k]] = row_of_sums;
             ranges.data[2 * order.data[k] + 1] = rows_here;
         }
-        const int first_row = row_of_sums - (patches_of.data[k] & 0xffff);
         Ranges later;
         for (int row = rows.first; row <= rows.last; ++row) {
             const int step = row - rows.first;
@@ -163,11 +166,10 @@ FILL = (
                 range = {later.first[step % SPANS], later.last[step % SPANS]};
             }
             int* const next_of_row = next + row * columns;
-            const int rows_before = first_row + (row / PATCH - patch_row) * across;
+#pragma clang loop unroll(disable)
             for (int column = range.first; column <= range.last; ++column, ++entry) {
                 const int place = next_of_row[column]++;
                 listed.data[place] = k;
-                if (keeps_rows) row_of.data[place] = rows_before + column / PATCH;
                 if (keeps_places) places.data[entry] = place;
                 if (keeps_tiles) tiles.data[entry] = row * columns + column;
             }
@@ -221,7 +223,7 @@ def fill_slice(
     entries: wp.array[int],
     places: wp.array[int],
     tiles: wp.array[int],
-    row_of: wp.array[int],
+    row_places: wp.array2d[int],
     ranges: wp.array2d[int],
 ): ...
 
@@ -296,7 +298,7 @@ def fill_tiles(
     entries_out: wp.array[int],  # [V + 1] first entry of each splat
     places_out: wp.array[int],  # [I] place of each entry; or empty
     tiles_out: wp.array[int],  # [I] tile of each entry; or empty
-    row_of_out: wp.array[int],  # [I] row of sums of each place; or empty, as what follows
+    row_places_out: wp.array2d[int],  # [V, 2] a, b: the row of sums in patch (r, c) is a + b r + c; or empty, as below
     ranges_out: wp.array2d[int],  # [N + 1, 2] first row of sums of each Gaussian and their number; zeroed; last: all
 ):
     """Write the tile lists. One thread per slice; the cursors keep slices apart."""
@@ -316,6 +318,6 @@ def fill_tiles(
         entries_out,
         places_out,
         tiles_out,
-        row_of_out,
+        row_places_out,
         ranges_out,
     )

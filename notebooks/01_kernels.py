@@ -336,7 +336,7 @@ def bin_splats(camera, splats, status, depths):
         "tiles": tiles,  # [I] tile of each entry
     }
     inputs = [0, order, ordered, *sizes, totals, spans, rows, patches, cursors]
-    nothing = [wp.zeros(0, dtype=int), wp.zeros((0, 2), dtype=int)]  # rows of sums: only gradients need them
+    nothing = [wp.zeros((0, 2), dtype=int)] * 2  # rows of sums: only gradients need them
     wp.launch(binning_lanes.fill_tiles, 1, inputs, [listed, lists["entries"], places, tiles, *nothing])
     return lists
 

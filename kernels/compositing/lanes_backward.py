@@ -60,7 +60,7 @@ def make_composite_backward(wide: bool, depth: bool, absolute: bool) -> wp.Kerne
         slot: int,  # scratch of this launch
         offsets: wp.array[int],  # [tiles + 1]
         listed: wp.array[int],  # [I]
-        row_of: wp.array[int],  # [I] row of sums of each place
+        row_places: wp.array2d[int],  # [V, 2] a, b: the row of sums in patch (r, c) is a + b r + c
         splats: wp.array[Splat],  # [V]
         features: wp.array3d[Lanes],  # [N, S, 1] channels in slices of 16 (wide)
         transmittance: wp.array2d[float],  # [H, W]
@@ -84,7 +84,7 @@ def make_composite_backward(wide: bool, depth: bool, absolute: bool) -> wp.Kerne
             base + wp.tid(),
             offsets,
             listed,
-            row_of,
+            row_places,
             splats,
             features,
             transmittance,

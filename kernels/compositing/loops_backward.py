@@ -185,7 +185,7 @@ REPLAY = """
     const Row p3 = FOLD_8(sums[6], sums[7]), p4 = FOLD_8(sums[8], sums[9]), p5 = FOLD_8(sums[10], sums[11]);
     const Row q0 = FOLD_4(p0, p1), q1 = FOLD_4(p2, p3), q2 = FOLD_4(p4, p5);
     const Row r0 = FOLD_2(q0, q1), r1 = FOLD_2(q2, zero);
-    const int row_of_sums = row_of.data[place];
+    const int row_of_sums = row_of(rank);
     Row* const to = reinterpret_cast<Row*>(rows.data + row_of_sums);
     auto& taken = used.data[row_of_sums];
     const Row nothing = zero;
@@ -203,6 +203,9 @@ PATCH_WALK = (
     const int across_image = (width + TILE - 1) / TILE, down_image = (height + TILE - 1) / TILE;
     const int patches = (across_image + PATCH - 1) / PATCH;
     const int first_column = patch % patches * PATCH, first_row = patch / patches * PATCH;
+    const auto row_of = [&](int rank) -> int {
+        return row_places.data[2 * rank] + row_places.data[2 * rank + 1] * (patch / patches) + patch % patches;
+    };
     const int end_column = first_column + PATCH < across_image ? first_column + PATCH : across_image;
     const int end_row = first_row + PATCH < down_image ? first_row + PATCH : down_image;
     for (int tile_row = first_row; tile_row < end_row; ++tile_row)
@@ -215,9 +218,11 @@ PATCH_WALK = (
             const int first = offsets_of.data[tile];
             for (int order = tile_end; order >= 0; --order) {
                 const int place = first + order, rank = listed.data[place];
-                const int ahead = place - AHEAD > first ? place - AHEAD : first;
-                __builtin_prefetch(splats.data + listed.data[ahead]);
-                __builtin_prefetch(rows.data + row_of.data[ahead], 1);
+                const int ahead = listed.data[place - AHEAD > first ? place - AHEAD : first];
+                __builtin_prefetch(splats.data + ahead);
+                __builtin_prefetch(row_places.data + 2 * ahead);
+                const int soon = listed.data[place - AHEAD / 2 > first ? place - AHEAD / 2 : first];
+                __builtin_prefetch(rows.data + row_of(soon), 1);
                 REPLAY
             }
         }
@@ -249,7 +254,7 @@ def patch_replay(wide: bool, depth: bool, absolute: bool, min_passed: float) -> 
         patch: int,
         offsets_of: wp.array[int],  # [tiles + 1] first place of each tile
         listed: wp.array[int],  # [I]
-        row_of: wp.array[int],  # [I]
+        row_places: wp.array2d[int],  # [V, 2]
         splats: wp.array[Splat],  # [V]
         features: wp.array3d[Lanes],  # [N, S, 1] (wide)
         transmittance: wp.array2d[float],  # [H, W]

@@ -230,7 +230,7 @@ def replay(
     maps += [view((v_depth if depth else v_depth[:0]).contiguous(), wp.float32)]
     gradient = lane_scratch("backward gradient", TILE_ROWS, slices.shape[1] * LANE if wide else 0, device)
     offsets, listed, splats = lists.arrays()
-    inputs = [offsets, listed, view(lists.row_of, wp.int32), splats, view(slices.unsqueeze(2), Lanes), *maps]
+    inputs = [offsets, listed, view(lists.row_places, wp.int32), splats, view(slices.unsqueeze(2), Lanes), *maps]
     inputs += [tiles.knobs(settings), camera.width, camera.height, gradient]
     kernel = compositing_lanes_backward.make_composite_backward(wide, depth, absolute)
     outputs = [view(rows, Lanes), view(used, wp.uint8), view(feature_rows, Lanes)]

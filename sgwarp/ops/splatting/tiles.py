@@ -65,7 +65,7 @@ class TileLists:
     entries: Tensor  # int32 [V + 1] first entry of each rank
     places: Tensor  # int32 [I] place of each entry; empty unless asked for
     tiles: Tensor  # int32 [I] tile of each entry; empty unless asked for
-    row_of: Tensor  # int32 [I] row of sums of each place; empty unless asked for, as what follows
+    row_places: Tensor  # int32 [V, 2] where the rows of sums of each rank are; empty unless asked for, as what follows
     row_ranges: Tensor  # int32 [N + 1, 2] first row of sums of each Gaussian and their number; last: of all
 
     @property
@@ -314,17 +314,17 @@ def bin_by_counting(
         "entries": count + 1,
         "places": total if places else 0,
         "entry tiles": total if tiles else 0,
-        "row of": total if rows else 0,
+        "row places": 2 * count if rows else 0,
         "row ranges": 2 * (len(projected.status) + 1) if rows else 0,
     }
-    listed, entries, places_of, tiles_of, row_of, ranges = (
+    listed, entries, places_of, tiles_of, row_places, ranges = (
         _integers(name, length, device, keep) for name, length in lengths.items()
     )
-    ranges = ranges.zero_().view(-1, 2)
+    row_places, ranges = row_places.view(-1, 2), ranges.zero_().view(-1, 2)
     inputs = [view(order, wp.int32), splats, *sizes, shared[1], *kept, shared[0]]
-    outputs = [view(t, wp.int32) for t in (listed, entries, places_of, tiles_of, row_of, ranges)]
+    outputs = [view(t, wp.int32) for t in (listed, entries, places_of, tiles_of, row_places, ranges)]
     launch(binning_lanes.fill_tiles, SLICES, inputs, outputs, device=device, chunk=1)
-    return TileLists(order, memory, offsets, listed, entries, places_of, tiles_of, row_of, ranges)
+    return TileLists(order, memory, offsets, listed, entries, places_of, tiles_of, row_places, ranges)
 
 
 def bin_by_sorting(
@@ -368,7 +368,7 @@ def bin_by_sorting(
     outputs = [view(listed, wp.int32), view(places_of, wp.int32)]
     launch_plain(binning.list_sorted, total, [view(values, wp.int32), view(ranks, wp.int32)], outputs, device=device)
     none = order.new_empty(0, 2)
-    return TileLists(order, memory, offsets, listed, entries, places_of, tiles_of, none[:, 0], none)
+    return TileLists(order, memory, offsets, listed, entries, places_of, tiles_of, none, none)
 
 
 def _places_in_room(counts: Tensor, room: ListRoom) -> Tensor:

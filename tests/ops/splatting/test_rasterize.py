@@ -152,9 +152,11 @@ def test_rows_of_sums_belong_to_a_splat_in_a_patch(scene):
     projected, order, colors, lists = lists_of(gaussians, camera)
     lists = tiles.bin_splats(projected, order, colors, camera, tiles=True, places=True, rows=True, keep=True)
     columns, patch = -(-camera.width // 16), 4
-    offsets, ranks, rows = (t.long() for t in (lists.offsets, lists.listed, lists.row_of))
+    offsets, ranks = lists.offsets.long(), lists.listed.long()
     tile = torch.repeat_interleave(torch.arange(lists.tile_count), offsets.diff())
     place = torch.stack([ranks, tile // columns // patch, tile % columns // patch], dim=1)
+    start, step = lists.row_places[ranks].long().unbind(1)
+    rows = start + step * place[:, 1] + place[:, 2]
     # As many rows as there are pairs of a splat and a patch, and never two pairs in one row.
     pairs, which = place.unique(dim=0, return_inverse=True)
     owner = torch.full((int(lists.row_ranges[-1, 0]),), -1)
