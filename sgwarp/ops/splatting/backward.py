@@ -21,7 +21,7 @@ from sgwarp.kernels.native import GROUP
 from sgwarp.kernels.projection import backward as kernels
 from sgwarp.kernels.projection import lanes_backward as projection_lanes_backward
 from sgwarp.kernels.transmittance import Lanes
-from sgwarp.ops.launcher import fresh, launch, launch_blocks, scratch, view
+from sgwarp.ops.launcher import fresh, get_threads, launch, launch_blocks, scratch, view
 from sgwarp.ops.splatting import tiles
 from sgwarp.ops.splatting.forward import LANE, TILE_ROWS, in_slices, lane_scratch, runs_in_blocks
 from sgwarp.ops.splatting.lifting import LiftSums, add_weighted
@@ -29,6 +29,7 @@ from sgwarp.ops.splatting.settings import RasterSettings
 from sgwarp.scene import Camera, FeatureMap, Gaussians
 
 TOGETHER = 4  # slices of 16 channels up to which the features' gradient comes with the geometry's
+CHUNKS = 32  # of patches for a thread: few patches hold many splats, and the last to come is waited for
 GROUPS = 1024  # partial sums of the pose's gradient
 
 
@@ -224,7 +225,9 @@ def replay(
     rows = scratch("backward rows", row_count * LANE, torch.float32, device).view(-1, LANE)
     used = scratch("rows in use", row_count, torch.uint8, device).zero_()
     feature_rows = scratch("feature rows", math.prod(shape), torch.float32, device).view(shape)
-    narrow = v_depth[:0, :0, None] if wide else pad(v_image, (0, 3 - channels))
+    narrow = v_depth[:0, :0, None] if wide else v_image
+    if channels < 3:
+        narrow = pad(narrow, (0, 3 - channels))
     maps = [view(t.contiguous(), wp.float32) for t in (transmittance, v_transmittance)]
     maps += [view(last, wp.int32), view(narrow.contiguous(), wp.float32), view(pixels, Lanes)]
     maps += [view((v_depth if depth else v_depth[:0]).contiguous(), wp.float32)]
@@ -234,7 +237,9 @@ def replay(
     inputs += [tiles.knobs(settings), camera.width, camera.height, gradient]
     kernel = compositing_lanes_backward.make_composite_backward(wide, depth, absolute)
     outputs = [view(rows, Lanes), view(used, wp.uint8), view(feature_rows, Lanes)]
-    launch(kernel, _patch_count(camera), inputs, outputs, device=device, slots=True, chunk=1)
+    patches = _patch_count(camera)
+    chunk = max(1, patches // (CHUNKS * get_threads()))
+    launch(kernel, patches, inputs, outputs, device=device, slots=True, chunk=chunk)
     at_depth, *_ = row_columns(wide, depth, absolute)
     return ReplayedRows(lists, rows, used, feature_rows, at_depth if depth else -1)
 
