@@ -50,6 +50,29 @@ WRITE = """
     }
 """
 
+# Last contributors of a tile's rows, from lanes to pixels.
+WRITE_LAST = """
+    const int rows = height - y0 < 16 ? height - y0 : 16, inside = width - x0 < 16 ? width - x0 : 16;
+    for (int row = 0; row < rows; ++row) {
+        int* const to = last_out.data + (y0 + row) * last_out.shape[1] + x0;
+        const Row* const row_state = reinterpret_cast<const Row*>(state.data + (slot * 16 + row) * state.shape[2]);
+        const Ints last = __builtin_convertvector(row_state[plane], Ints);
+        if (inside == 16) *reinterpret_cast<Ints*>(to) = last;
+        else for (int i = 0; i < inside; ++i) to[i] = last[i];
+    }
+"""
+
+# A tile's scratch before its first fragment.
+OPEN = """
+    const float columns = width - x0;
+    const Row inside = offsets + 7.5f < columns ? one : zero;
+    for (int row = 0; row < 16; ++row) {
+        Row* const row_state = reinterpret_cast<Row*>(state.data + (slot * 16 + row) * state.shape[2]);
+        row_state[0] = inside;
+        for (int plane = 1; plane < planes; ++plane) row_state[plane] = plane < unset ? zero : -one;
+    }
+"""
+
 FORWARD = (
     REACHING
     + """
@@ -108,6 +131,30 @@ def write_row(
     state: wp.array3d[Lanes],  # [slots, 16, planes]
     colors_out: wp.array2d[wp.vec3],  # [H, W]
     transmittance_out: wp.array2d[float],  # [H, W]
+): ...
+
+
+@wp.func_native(snippet(WRITE_LAST))
+def write_last(
+    slot: int,
+    x0: int,  # first pixel of the tile
+    y0: int,
+    width: int,
+    height: int,
+    state: wp.array3d[Lanes],  # [slots, 16, planes]
+    plane: int,
+    last_out: wp.array2d[int],  # [H, W]
+): ...
+
+
+@wp.func_native(snippet(OPEN))
+def open_state(
+    slot: int,
+    x0: int,  # first pixel of the tile; lanes beyond the image start closed
+    width: int,
+    planes: int,
+    unset: int,  # first plane that holds numbers of fragments, of which there is none
+    state: wp.array3d[Lanes],  # [slots, 16, planes] out
 ): ...
 
 
