@@ -20,19 +20,19 @@ from sgwarp.ops.splatting import forward as rasterize
 
 Job = Callable[[], object]
 
-# Where each stage of the pipeline is called from; "sums" is a kernel launched within the backward pass of compositing.
+# Where each stage of the pipeline is called from. The last is the sums per Gaussian and the adjoints of projection and
+# colour in one.
 STAGES: tuple[tuple[str, ModuleType, str], ...] = (
     ("project", tiles, "project"),
     ("order", tiles, "depth_order"),
-    ("shade", tiles, "shade"),
     ("bin", tiles, "bin_splats"),
     ("composite", rasterize, "composite"),
     ("composite", differentiable, "composite_recorded"),
-    ("composite backward", backward, "composite_backward"),
-    ("project backward", backward, "project_backward"),
-    ("shade backward", backward, "shade_backward"),
+    ("composite backward", backward, "replay"),
+    ("Gaussians backward", backward, "differentiate"),
 )
-SUMS = "sum_used_rows"
+# Stages of the limit that are one here.
+TOGETHER = {"project": ("project", "shade"), "Gaussians backward": ("sums", "project backward", "shade backward")}
 
 
 @dataclass(frozen=True)
@@ -87,17 +87,11 @@ class StageClock:
     def watching(self) -> Iterator[None]:
         """Time the stages of everything that is called meanwhile."""
         kept = [(module, name, getattr(module, name)) for _, module, name in STAGES]
-        launcher = backward.launch
-        sums = self.timed("sums", launcher)
         for (stage, *_), (module, name, function) in zip(STAGES, kept, strict=True):
             setattr(module, name, self.timed(stage, function))
-        backward.launch = lambda kernel, *args, **kwargs: (sums if kernel.key.startswith(SUMS) else launcher)(
-            kernel, *args, **kwargs
-        )
         try:
             yield
         finally:
-            backward.launch = launcher
             for module, name, function in kept:
                 setattr(module, name, function)
 

@@ -8,7 +8,7 @@ import numpy as np
 import scenes
 import torch
 from limit_training import TrainingLimit
-from timing import Run, fastest, plural, report, shares, stage_times
+from timing import TOGETHER, Run, fastest, plural, report, shares, stage_times
 from torch import Tensor
 
 from sgwarp.ops.splatting.autograd import rasterize
@@ -98,7 +98,7 @@ def measure(headline: int, cores: int, rounds: int) -> dict[str, object]:
     for name, share in shares(stages).items():
         report(f"{name} [ms]", stages[name])
         report(f"{name}, share", share, f"<= {MOST_OF_A_STAGE}" if not name.startswith("composite") else "")
-        rival = by_hand.get(f"limit's {name}, {every}", np.nan)
+        rival = sum(by_hand.get(f"limit's {part}, {every}", np.nan) for part in TOGETHER.get(name, (name,)))
         if rival > 0:
             report(f"{name} / limit", stages[name] / rival)
     return results

@@ -72,6 +72,7 @@ HELPERS = """
     };
     // Rows and columns of 16 x 16 values change places: squares of 8, 4, 2 and 1 across the diagonal.
 #define EXCHANGE(step, low, high)                                    \\
+    _Pragma("clang loop unroll(full)")                               \\
     for (int i = 0; i < 16; ++i)                                     \\
         if (!(i & step)) {                                           \\
             const Row a = square[i], b = square[i + step];           \\
@@ -123,9 +124,61 @@ HELPERS = """
 """
 
 
+def _shuffled(vectors: list[str], lanes: list[tuple[int, int]]) -> str:
+    """C++ that picks lane i of the result from (vector, lane) number i, one shuffle of two vectors after the other."""
+    result = vectors[0]
+    for step in range(1, len(vectors)):
+        kept = [lane if step == 1 else i for i, (_, lane) in enumerate(lanes)]
+        taken = [16 + lane if vector == step else kept[i] for i, (vector, lane) in enumerate(lanes)]
+        result = f"__builtin_shufflevector({result}, {vectors[step]}, {', '.join(map(str, taken))})"
+    return result
+
+
+def columns(*widths: int) -> str:
+    """C++ between 16 consecutive structures of some floats each and vectors of one float of all of them.
+
+    Defines `split_W(from, to)`, which reads 16 W floats and writes W vectors, and `join_W(from, to)`, the way back.
+    """
+    code = ""
+    for width in widths:
+        memory, vectors = ([f"{name}{k}" for k in range(width)] for name in "mv")
+        split = [_shuffled(memory, [divmod(width * i + k, 16) for i in range(16)]) for k in range(width)]
+        join = [_shuffled(vectors, [divmod(16 * k + i, width)[::-1] for i in range(16)]) for k in range(width)]
+        for name, given, made, source, target in (
+            ("split", memory, split, "const float* from, Row* to", "to[{}]"),
+            ("join", vectors, join, "const Row* from, float* to", "reinterpret_cast<Row*>(to)[{}]"),
+        ):
+            read = "reinterpret_cast<const Row*>(from)[{}]" if name == "split" else "from[{}]"
+            code += f"    const auto {name}_{width} = []({source}) {{\n"
+            code += "".join(f"        const Row {x} = {read.format(k)};\n" for k, x in enumerate(given))
+            code += "".join(f"        {target.format(k)} = {x};\n" for k, x in enumerate(made))
+            code += "    };\n"
+    return code
+
+
+def by_groups(*bodies: str, count: str) -> str:
+    """C++ that runs a body for each `group` of 16 elements that a kernel thread, `block`, takes; then the next body.
+
+    Warp copies the arguments of a kernel for each of its threads, and what is copied has to arrive in memory first.
+
+    Args:
+        bodies: They take 16 of the elements, or what there is, from 16 `group` on.
+        count: How many elements there are.
+    """
+    code = ""
+    for k, body in enumerate(bodies):
+        code += f"    const auto run_{k} = [&](int group) {{\n{body}    }};\n"
+        code += f"    for (int group = GROUPS * block; group < GROUPS * (block + 1) && 16 * group < {count}; ++group)\n"
+        code += f"        run_{k}(group);\n"
+    return code
+
+
+GROUP = 64  # Gaussians of a kernel thread, 16 at a time
+
+
 def snippet(body: str, **constants: bool | int | float) -> str:
     """The C++ of a loop. Its options come first as `constexpr`; what they switch off the compiler removes."""
-    shared = {"LEVEL_SLACK": float(LEVEL_SLACK), "BATCH": int(BATCH)}
+    shared = {"LEVEL_SLACK": float(LEVEL_SLACK), "BATCH": int(BATCH), "GROUPS": GROUP // 16}
     return "".join(_declaration(name, value) for name, value in {**shared, **constants}.items()) + HELPERS + body
 
 

@@ -39,7 +39,7 @@ from sgwarp.kernels.gaussian import Pinhole, Splat
 from sgwarp.kernels.harmonics import forward as harmonics
 from sgwarp.kernels.lifting import lanes as lifting_lanes
 from sgwarp.kernels.lifting import shared as lifting
-from sgwarp.kernels.native import Seen
+from sgwarp.kernels.native import GROUP, Seen
 from sgwarp.kernels.projection import forward as projection
 from sgwarp.kernels.projection import lanes as projection_lanes
 from sgwarp.kernels.transmittance import LaneIds, Lanes
@@ -219,8 +219,8 @@ first_pose, second_pose = pose(-62), pose(38, elevation=30)
 # %%
 def project(camera):
     splats, status, depths = wp.zeros(N, dtype=Splat), wp.zeros(N, dtype=wp.uint8), wp.zeros(N, dtype=float)
-    inputs = [0, means, rotations, deviations, opacity, camera, knobs]
-    wp.launch(projection_lanes.project_groups, -(-N // 16), inputs, [splats, status, depths])
+    inputs = [0, means, rotations, deviations, opacity, coefficients, -1, camera, knobs]  # -1: no colours yet
+    wp.launch(projection_lanes.project_groups, -(-N // GROUP), inputs, [splats, status, depths])
     return splats, status, depths
 
 
@@ -317,26 +317,27 @@ def bin_splats(camera, splats, status, depths):
     count = len(order)
     colors, ordered = wp.zeros(count, dtype=wp.vec3), wp.zeros(count, dtype=Splat)
     wp.launch(harmonics.evaluate_harmonics, count, [0, order, means, coefficients, 1, camera], [colors])
-    tile_counts, splat_counts = wp.zeros((1, TILES), dtype=int), wp.zeros(count, dtype=int)
+    cursors, totals = wp.zeros((1, TILES), dtype=int), wp.zeros((2, 2), dtype=wp.int64)
     sizes = [count, WIDTH, HEIGHT]
-    spans = wp.zeros(count, dtype=wp.uint64)  # columns that a splat touches, kept from counting for filling
-    rows = wp.zeros(count, dtype=int)  # and the tile rows
-    outputs = [ordered, tile_counts, splat_counts, spans, rows]
+    spans = wp.zeros(2 * count, dtype=wp.uint64)  # columns that a splat touches, kept for filling the lists
+    rows, patches = wp.zeros(count, dtype=int), wp.zeros(count, dtype=int)  # the tile rows; for gradients
+    outputs = [ordered, cursors, totals, spans, rows, patches]
     wp.launch(binning_lanes.count_tiles, 1, [0, order, splats, colors, *sizes], outputs)
-    offsets, entries = starts(tile_counts.numpy()[0]), starts(splat_counts.numpy())
-    listed, places, tiles = (wp.zeros(int(offsets[-1]), dtype=int) for _ in range(3))
+    offsets = wp.zeros(TILES + 1, dtype=int)
+    wp.launch(binning_lanes.place_slices, 1, [0], [cursors, totals, offsets])
+    listed, places, tiles = (wp.zeros(int(offsets.numpy()[-1]), dtype=int) for _ in range(3))
     lists = {
         "order": order,  # [V] Gaussians front to back
         "splats": ordered,  # [V] likewise
-        "offsets": wp.array(offsets),  # [tiles + 1] first place of each tile
+        "offsets": offsets,  # [tiles + 1] first place of each tile
         "listed": listed,  # [I] the lists: ranks, tile by tile
-        "entries": wp.array(entries),  # [V + 1] first entry of each, one per tile
+        "entries": wp.zeros(count + 1, dtype=int),  # [V + 1] first entry of each, one per tile
         "places": places,  # [I] place of each entry
         "tiles": tiles,  # [I] tile of each entry
     }
-    cursors = wp.array(offsets[None, :-1].copy())
-    inputs = [0, ordered, *sizes, lists["entries"], spans, rows, cursors]
-    wp.launch(binning_lanes.fill_tiles, 1, inputs, [listed, places, tiles])
+    inputs = [0, order, ordered, *sizes, totals, spans, rows, patches, cursors]
+    nothing = [wp.zeros((0, 2), dtype=int)] * 2  # rows of sums: only gradients need them
+    wp.launch(binning_lanes.fill_tiles, 1, inputs, [listed, lists["entries"], places, tiles, *nothing])
     return lists
 
 

@@ -10,7 +10,7 @@ from functools import cache
 import warp as wp
 
 from sgwarp.kernels.binning import TILE
-from sgwarp.kernels.compositing.loops import gather_batch, row_walk, write_row
+from sgwarp.kernels.compositing.loops import gather_batch, open_state, row_walk, write_last, write_row
 from sgwarp.kernels.gaussian import Splat
 from sgwarp.kernels.native import BATCH, Seen
 from sgwarp.kernels.projection.forward import Knobs
@@ -48,13 +48,7 @@ def open_tile(
 
     Plane 0 is the transmittance; the planes from `unset` on hold numbers of fragments, of which there is none.
     """
-    for row in range(TILE):
-        state[slot, row, 0] = open_lanes(x0, width)
-        for plane in range(1, planes):
-            value = Lanes(0.0)
-            if plane >= unset:
-                value = Lanes(-1.0)
-            state[slot, row, plane] = value
+    open_state(slot, x0, width, planes, unset, state)
     return open_row_mask(y0, height)
 
 
@@ -116,24 +110,6 @@ def color_walk(depth: bool, record: bool) -> wp.Function:
 def color_planes(depth: bool, record: bool) -> int:
     """Scratch vectors per row that compositing colours needs."""
     return (6 if depth else 4) + int(record)
-
-
-@wp.func
-def write_last(
-    slot: int,
-    x0: int,
-    y0: int,
-    width: int,
-    height: int,
-    state: wp.array3d[Lanes],
-    plane: int,
-    last_out: wp.array2d[int],
-):
-    """Last contributors of a tile, from lanes to pixels."""
-    for row in range(wp.min(TILE, height - y0)):
-        last = state[slot, row, plane]
-        for i in range(wp.min(LANES, width - x0)):
-            last_out[y0 + row, x0 + i] = int(last[i])
 
 
 @cache

@@ -14,19 +14,19 @@ Along a row only u changes, and from row to row u and v change by b and c. So a 
 vectors, d its distance to the middle one of the rows at work, and the six moments follow once per fragment. Counted
 from the middle, d b stays as small as a tile, and nothing large cancels.
 
-The thread that owns a tile writes one row for each place of its list, so no two threads write the same memory. Places
-that no pixel saw, a third in a room, have none: `used` says so in one byte each.
+A thread owns a patch of 4 x 4 tiles and replays them one after the other. What it adds up of a splat goes to one row:
+no two threads write the same memory, and no number of threads changes the order of a sum. Rows of splats that no
+pixel of the patch saw stay as they are: `used` says so in one byte each.
 """
 
 from functools import cache
 
 import warp as wp
 
-from sgwarp.kernels.binning import AHEAD, TILE, prefetch
-from sgwarp.kernels.compositing.loops import fragment_replay, read_tile
+from sgwarp.kernels.compositing.loops_backward import patch_replay
 from sgwarp.kernels.gaussian import Splat
 from sgwarp.kernels.projection.forward import Knobs
-from sgwarp.kernels.transmittance import LANE_OPTIONS, LaneIds, Lanes
+from sgwarp.kernels.transmittance import LANE_OPTIONS, Lanes
 
 wp.set_module_options(LANE_OPTIONS)
 
@@ -51,80 +51,55 @@ def make_composite_backward(wide: bool, depth: bool, absolute: bool) -> wp.Kerne
         depth: The sum of alpha T z has a gradient too.
         absolute: Also sum the magnitudes of each pixel's gradient of the projected mean.
     """
-    replay_fragment = fragment_replay(wide, depth, absolute, MIN_PASSED)
+    replay_patch = patch_replay(wide, depth, absolute, MIN_PASSED)
 
     @wp.kernel(module="unique", module_options=LANE_OPTIONS, enable_backward=False)
     def composite_backward(
         # In:
-        base: int,  # first tile of this launch
+        base: int,  # first patch of this launch
         slot: int,  # scratch of this launch
         offsets: wp.array[int],  # [tiles + 1]
         listed: wp.array[int],  # [I]
+        row_places: wp.array2d[int],  # [V, 2] a, b: the row of sums in patch (r, c) is a + b r + c
         splats: wp.array[Splat],  # [V]
         features: wp.array3d[Lanes],  # [N, S, 1] channels in slices of 16 (wide)
-        transmittance: wp.array2d[Lanes],  # [H, tile columns]
-        v_transmittance: wp.array2d[Lanes],  # [H, tile columns] its gradient
-        last: wp.array2d[LaneIds],  # [H, tile columns] last contributor, counted from its tile's first, -1 = none
-        gradient: wp.array3d[Lanes],  # [H, tile columns, 3] of the image; or scratch [slots, 16, 16 S] (wide)
-        pixels: wp.array3d[Lanes],  # [H, W, S] gradient of the image (wide)
-        depth_gradient: wp.array2d[Lanes],  # [H, tile columns] of the depth sum (depth)
+        transmittance: wp.array2d[float],  # [H, W]
+        v_transmittance: wp.array2d[float],  # [H, W] its gradient
+        last: wp.array2d[int],  # [H, W] last contributor, counted from its tile's first, -1 = none
+        v_image: wp.array3d[float],  # [H, W, 3] gradient of the image
+        pixels: wp.array3d[Lanes],  # [H, W, S] the same (wide)
+        v_depth: wp.array2d[float],  # [H, W] gradient of the depth sum (depth)
         knobs: Knobs,
         width: int,
         height: int,
-        state: wp.array3d[Lanes],  # [slots, 16, 2] scratch: transmittance, value behind
-        reach: wp.array2d[int],  # [slots, 16] scratch: last contributor of each row
+        gradient: wp.array3d[Lanes],  # [slots, 16, 16 S] scratch: the gradient of a tile's pixels (wide)
         # Out:
-        rows_out: wp.array[Lanes],  # [I] by place, column q in lane q; written where used
-        used_out: wp.array[wp.uint8],  # [I] by place: whether some pixel saw the fragment
-        features_out: wp.array2d[Lanes],  # [I, S] gradient of the features, by place; or empty (wide)
+        rows_out: wp.array[Lanes],  # [R] rows of sums, column q in lane q; written where used
+        used_out: wp.array[wp.uint8],  # [R] whether some pixel saw the splat in this patch; zeroed
+        features_out: wp.array2d[Lanes],  # [R, S] gradient of the features; or empty (wide)
     ):
-        """Paper eq. 1, differentiated, for one tile per thread."""
-        tile = base + wp.tid()
-        columns = (width + TILE - 1) / TILE
-        column = tile % columns
-        x0 = column * TILE
-        y0 = (tile / columns) * TILE
-        tile_reach = int(-1)
-        for row in range(TILE):
-            row_reach = int(-1)
-            if y0 + row < height:
-                state[slot, row, 0] = transmittance[y0 + row, column]
-                state[slot, row, 1] = v_transmittance[y0 + row, column]
-                row_reach = wp.max(last[y0 + row, column])
-            reach[slot, row] = row_reach
-            tile_reach = wp.max(tile_reach, row_reach)
-        first = offsets[tile]
-        for k in range(first + tile_reach + 1, offsets[tile + 1]):
-            used_out[k] = wp.uint8(0)
-            if wp.static(wide):
-                for s in range(features_out.shape[1]):
-                    features_out[k, s] = Lanes(0.0)
-        if wp.static(wide):
-            read_tile(slot, x0, y0, wp.min(TILE, height - y0), wp.min(TILE, width - x0), pixels, gradient)
-        for done in range(tile_reach + 1):
-            order = tile_reach - done  # counted from the tile's first, as all orders here
-            k = first + order
-            prefetch(splats, listed[first + wp.max(order - AHEAD, 0)])
-            replay_fragment(
-                slot,
-                listed[k],
-                k,
-                order,
-                column,
-                x0,
-                y0,
-                splats,
-                features,
-                last,
-                gradient,
-                pixels,
-                depth_gradient,
-                knobs,
-                state,
-                reach,
-                rows_out,
-                used_out,
-                features_out,
-            )
+        """Paper eq. 1, differentiated, for one patch of tiles per thread."""
+        replay_patch(
+            slot,
+            base + wp.tid(),
+            offsets,
+            listed,
+            row_places,
+            splats,
+            features,
+            transmittance,
+            v_transmittance,
+            last,
+            v_image,
+            pixels,
+            v_depth,
+            knobs,
+            width,
+            height,
+            gradient,
+            rows_out,
+            used_out,
+            features_out,
+        )
 
     return composite_backward

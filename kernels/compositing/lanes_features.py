@@ -9,8 +9,8 @@ from functools import cache
 import warp as wp
 
 from sgwarp.kernels.binning import TILE
-from sgwarp.kernels.compositing.lanes import open_tile, write_last
-from sgwarp.kernels.compositing.loops import REACHING, gather_batch
+from sgwarp.kernels.compositing.lanes import open_tile
+from sgwarp.kernels.compositing.loops import REACHING, gather_batch, write_last
 from sgwarp.kernels.gaussian import Splat
 from sgwarp.kernels.native import BATCH, Seen, snippet
 from sgwarp.kernels.projection.forward import Knobs

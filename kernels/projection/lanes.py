@@ -7,7 +7,9 @@ compare them splat by splat. Comparisons are exact about NaN and infinity, as th
 import warp as wp
 
 from sgwarp.kernels.gaussian import EXACT_OPTIONS, LOG2_E, MIN_QUAT_NORM2, UNIT, Pinhole, Splat
-from sgwarp.kernels.native import snippet
+from sgwarp.kernels.harmonics import lanes as harmonics
+from sgwarp.kernels.harmonics.forward import BRIGHTEST
+from sgwarp.kernels.native import by_groups, columns, snippet
 from sgwarp.kernels.projection.backward import LN_2, SEEN
 from sgwarp.kernels.projection.forward import (
     DEGENERATE,
@@ -21,20 +23,22 @@ from sgwarp.kernels.projection.forward import (
 
 wp.set_module_options(EXACT_OPTIONS)
 
-GROUP = 16  # Gaussians of a kernel thread
-
-# Columns of 16 Gaussians, and back; what lies beyond the last repeats it.
+# Columns of 16 Gaussians; what lies beyond the last repeats it.
 COLUMNS = """
     const int first = group * 16, count = means.shape[0] - first < 16 ? means.shape[0] - first : 16;
-    const auto columns = [&](const float* from, int width, Row* to) {
+    const auto read = [&](const auto& split, const auto& array, int width, Row* to) {
+        const float* const from = reinterpret_cast<const float*>(array.data + first);
+        if (count == 16) return split(from, to);
+        float padded[64];
         for (int i = 0; i < 16; ++i)
-            for (int j = 0; j < width; ++j) to[j][i] = from[(i < count ? i : count - 1) * width + j];
+            for (int j = 0; j < width; ++j) padded[i * width + j] = from[(i < count ? i : count - 1) * width + j];
+        split(padded, to);
     };
     Row mean[3], quat[4], scale[3], given[1];
-    columns(reinterpret_cast<const float*>(means.data + first), 3, mean);
-    columns(reinterpret_cast<const float*>(quats.data + first), 4, quat);
-    columns(reinterpret_cast<const float*>(scales.data + first), 3, scale);
-    columns(opacities.data + first, 1, given);
+    read(split_3, means, 3, mean);
+    read(split_4, quats, 4, quat);
+    read(split_3, scales, 3, scale);
+    read(split_1, opacities, 1, given);
     const auto root = [](Row x) -> Row { return __builtin_elementwise_sqrt(x); };
     const auto& view = camera.rotation.data;
 """
@@ -96,7 +100,9 @@ PROJECT = (
 
     // Why each is left out: the first reason that holds.
     const Ints visible = VISIBLE;
-    Ints status = visible;
+    auto& kept = held[group % GROUPS];
+    Ints& status = kept.status;
+    status = visible;
     const auto leave_out = [&](Ints holds, int reason) {
         const Ints code = reason;
         status = (status == visible) & holds ? code : status;
@@ -109,10 +115,7 @@ PROJECT = (
 
     POINT
     leave_out(~((point[2] > camera.near) & (point[2] < camera.far)), OUTSIDE_DEPTH);
-    if (!bits(status == visible)) {
-        for (int i = 0; i < count; ++i) status_out.data[first + i] = status[i];
-        return;
-    }
+    if (!bits(status == visible)) return;
 
     JACOBIAN
     const Row x = camera.focal[0] * slope[0] + camera.principal[0];
@@ -147,121 +150,74 @@ PROJECT = (
     leave_out(~((x + half_width >= 0.5f) & (x - half_width <= width - 0.5f) & (y + half_height >= 0.5f)
               & (y - half_height <= height - 0.5f)), OFF_SCREEN);
 
-    for (int i = 0; i < count; ++i) status_out.data[first + i] = status[i];
-    for (int i = 0; i < count; ++i) depths_out.data[first + i] = point[2][i];
-    Row lines[16] = {x, y, a, b, c, level, point[2], half_width, half_height, reach, summit, inv_bc};
+    const Row lines[12] = {x, y, a, b, c, level, point[2], half_width, half_height, reach, summit, inv_bc};
+    for (int e = 0; e < 12; ++e) kept.lines[e] = lines[e];
+    for (int j = 0; j < 3; ++j) kept.away[j] = away[j];
+    // Coefficients are fetched while the next groups are projected.
+    const int size = 12 * (degree + 1) * (degree + 1);
+    for (unsigned left = degree < 0 ? 0 : bits(status == visible) & ((1u << count) - 1); left; left &= left - 1) {
+        const auto* const values = sh.data + (long long)(first + __builtin_ctz(left)) * sh.shape[1];
+        for (int byte = 0; byte < size; byte += 64) __builtin_prefetch(reinterpret_cast<const char*>(values) + byte);
+    }
+""".replace("    POINT\n", POINT)
+    .replace("    JACOBIAN\n", JACOBIAN)
+    .replace("    FACTOR\n", FACTOR)
+)
+
+# What the groups of a thread keep until the coefficients have come.
+HELD = """
+    struct Held {
+        Row lines[12], away[3];
+        Ints status;
+    };
+    Held held[GROUPS] __attribute__((aligned(64)));
+"""
+
+# Colours up to `degree`, and the splats. Those whose coefficients are not finite are left out as well.
+FINISH = """
+    const int first = group * 16, count = means.shape[0] - first < 16 ? means.shape[0] - first : 16;
+    auto& kept = held[group % GROUPS];
+    const Ints visible = VISIBLE;
+    Ints status = kept.status;
+    Row lines[16] = {};
+    unsigned left = bits(status == visible) & ((1u << count) - 1);
+    if (degree >= 0 && left) {
+        COEFFICIENTS
+        read_coefficients(left);
+        Row wrong = zero;  // zero times infinity or NaN is NaN
+#pragma clang loop unroll(full)
+        for (int e = 0; e < MOST; ++e)
+            if (e < in_use) wrong += 0.0f * blocks[e / 16][e % 16];
+        const Ints broken = NON_FINITE;
+        status = (status == visible) & ~(wrong == zero) ? broken : status;
+        left &= bits(status == visible);
+        const Row* const away = kept.away;
+        DIRECTION
+        COLOR
+        for (int j = 0; j < 3; ++j) {
+            const Row shown = color[j] > zero ? color[j] : zero;
+            lines[13 + j] = __builtin_elementwise_min(shown, zero + BRIGHTEST);
+        }
+    }
+    typedef wp::uint8 Bytes __attribute__((ext_vector_type(16), aligned(1)));
+    const Bytes bytes = __builtin_convertvector(status, Bytes);
+    if (count == 16) *reinterpret_cast<Bytes*>(status_out.data + first) = bytes;
+    else for (int i = 0; i < count; ++i) status_out.data[first + i] = bytes[i];
+    if (!left) return;
+    for (int e = 0; e < 12; ++e) lines[e] = kept.lines[e];
+    if (count == 16) *reinterpret_cast<Row*>(depths_out.data + first) = lines[6];
+    else for (int i = 0; i < count; ++i) depths_out.data[first + i] = lines[6][i];
     transpose(lines);
-    for (unsigned left = bits(status == visible) & ((1u << count) - 1); left; left &= left - 1) {
+    for (; left; left &= left - 1) {
         const int i = __builtin_ctz(left);
         reinterpret_cast<Row*>(splats_out.data)[first + i] = lines[i];
     }
-""".replace("    POINT\n", POINT)
-    .replace("    JACOBIAN\n", JACOBIAN)
-    .replace("    FACTOR\n", FACTOR)
-)
+""".replace("        COEFFICIENTS\n", harmonics.COEFFICIENTS)
+FINISH = FINISH.replace("        DIRECTION\n", harmonics.DIRECTION).replace("        COLOR\n", harmonics.COLOR)
 
-
-BACKWARD = (
-    COLUMNS
-    + """
-    Row moments[16];
-    const Row* const rows = reinterpret_cast<const Row*>(sums.data) + first;
-    for (int i = 0; i < 16; ++i) moments[i] = rows[i < count ? i : count - 1];
-    transpose(moments);
-    const Ints seen = moments[SEEN] != zero;
-    const auto write = [&](float* to, int width, const Row* from) {
-        for (int j = 0; j < width; ++j) {
-            const Row kept = seen ? from[j] : zero;
-            for (int i = 0; i < count; ++i) to[i * width + j] = kept[i];
-        }
-    };
-    POINT
-    JACOBIAN
-    FACTOR
-    const Row g = LN_2 * moments[0], gu = LN_2 * moments[1], gv = LN_2 * moments[2];
-    const Row guu = LN_2 * moments[3], guv = LN_2 * moments[4], gvv = LN_2 * moments[5];
-    const Row v_pixel[2] = {2.0f * a * gu, 2.0f * (b * gu + c * gv)};
-    // N = L^T M, then L (moments N).
-    Row v_x[3], v_y[3];
-    for (int j = 0; j < 3; ++j) {
-        const Row n_u = a * m_x[j] + b * m_y[j], n_v = c * m_y[j];
-        const Row q_u = (4.0f / LOG2_E) * (guu * n_u + guv * n_v), q_v = (4.0f / LOG2_E) * (guv * n_u + gvv * n_v);
-        v_x[j] = a * q_u, v_y[j] = b * q_u + c * q_v;
-    }
-    if (knobs.antialiased) {
-        // opacity sqrt(sharp / determinant): half the logarithm of both.
-        // A splat seen end on (sharp = 0) has no gradient here, and zero times infinity is NaN.
-        const Row half = 0.5f * moments[0];
-        const Row v_sharp = half == zero ? zero : half * (1.0f / sharp - 1.0f / determinant);
-        const Row v_trace = -half * knobs.dilation / determinant;
-        for (int j = 0; j < 3; ++j) {
-            const int k = (j + 1) % 3, l = (j + 2) % 3;
-            v_x[j] += 2.0f * (v_sharp * (m_y[k] * minors[l] - m_y[l] * minors[k]) + v_trace * m_x[j]);
-            v_y[j] += 2.0f * (v_sharp * (minors[k] * m_x[l] - minors[l] * m_x[k]) + v_trace * m_y[j]);
-        }
-    }
-    Row scaled_x[3], scaled_y[3], v_scale[3], v_axes[3][3];
-    for (int j = 0; j < 3; ++j) {
-        scaled_x[j] = v_x[j] * scale[j], scaled_y[j] = v_y[j] * scale[j];
-        v_scale[j] = v_x[j] * along_x[j] + v_y[j] * along_y[j];
-        v_axes[0][j] = fx * scaled_x[j], v_axes[1][j] = fy * scaled_y[j];
-        v_axes[2][j] = sx * scaled_x[j] + sy * scaled_y[j];
-    }
-    // Of the rows of J; where x/z or y/z is clamped, J does not depend on it.
-    Row row_x[3], row_y[3];
-    for (int i = 0; i < 3; ++i) {
-        row_x[i] = axes[i][0] * scaled_x[0] + axes[i][1] * scaled_x[1] + axes[i][2] * scaled_x[2];
-        row_y[i] = axes[i][0] * scaled_y[0] + axes[i][1] * scaled_y[1] + axes[i][2] * scaled_y[2];
-    }
-    const Row free_x = tangent[0] == slope[0] ? fx * row_x[2] : zero;
-    const Row free_y = tangent[1] == slope[1] ? fy * row_y[2] : zero;
-    const Row v_slope_x = camera.focal[0] * v_pixel[0] - free_x, v_slope_y = camera.focal[1] * v_pixel[1] - free_y;
-    const Row v_inv_z = camera.focal[0] * (row_x[0] - tangent[0] * row_x[2])
-                      + camera.focal[1] * (row_y[1] - tangent[1] * row_y[2]);
-    Row v_point[3] = {v_slope_x * inv_z, v_slope_y * inv_z,
-                      (-slope[0] * v_slope_x - slope[1] * v_slope_y - v_inv_z * inv_z) * inv_z};
-    if (at_depth >= 0) v_point[2] += moments[at_depth];
-    // From the camera's axes to the world's.
-    Row v_mean[3], v[3][3];
-    for (int i = 0; i < 3; ++i) {
-        v_mean[i] = view[0][i] * v_point[0] + view[1][i] * v_point[1] + view[2][i] * v_point[2];
-        for (int j = 0; j < 3; ++j)
-            v[i][j] = view[0][i] * v_axes[0][j] + view[1][i] * v_axes[1][j] + view[2][i] * v_axes[2][j];
-    }
-    // `quaternion_gradient`.
-    const Row inv_length = 1.0f / root(norm2);
-    const Row unit[4] = {quat[0] * inv_length, quat[1] * inv_length, quat[2] * inv_length, quat[3] * inv_length};
-    const Row qw = unit[0], ux = unit[1], uy = unit[2], uz = unit[3];
-    const Row yz = v[2][1] - v[1][2], zx = v[0][2] - v[2][0], xy_ = v[1][0] - v[0][1];
-    const Row s_xy = v[0][1] + v[1][0], s_xz = v[0][2] + v[2][0], s_yz = v[1][2] + v[2][1];
-    Row v_quat[4] = {2.0f * (ux * yz + uy * zx + uz * xy_),
-                     2.0f * (qw * yz + uy * s_xy + uz * s_xz - 2.0f * ux * (v[1][1] + v[2][2])),
-                     2.0f * (qw * zx + ux * s_xy + uz * s_yz - 2.0f * uy * (v[0][0] + v[2][2])),
-                     2.0f * (qw * xy_ + ux * s_xz + uy * s_yz - 2.0f * uz * (v[0][0] + v[1][1]))};
-    const Row radial = qw * v_quat[0] + ux * v_quat[1] + uy * v_quat[2] + uz * v_quat[3];
-    for (int j = 0; j < 4; ++j) v_quat[j] = (v_quat[j] - unit[j] * radial) * inv_length;
-    const Row v_opacity = moments[0] / given[0];
-    write(reinterpret_cast<float*>(means_out.data + first), 3, v_mean);
-    write(reinterpret_cast<float*>(quats_out.data + first), 4, v_quat);
-    write(reinterpret_cast<float*>(scales_out.data + first), 3, v_scale);
-    write(opacities_out.data + first, 1, &v_opacity);
-    write(reinterpret_cast<float*>(means2d_out.data + first), 2, v_pixel);
-    if (poses_out.shape[0] > 0) {
-        Row pose[12];
-        for (int r = 0; r < 3; ++r) {
-            for (int j = 0; j < 3; ++j)
-                pose[3 * r + j] = v_point[r] * away[j] + v_axes[r][0] * R[j][0] + v_axes[r][1] * R[j][1]
-                                + v_axes[r][2] * R[j][2];
-            pose[9 + r] = v_point[r];
-        }
-        write(poses_out.data + first * 12, 12, pose);
-    }
-""".replace("    POINT\n", POINT)
-    .replace("    JACOBIAN\n", JACOBIAN)
-    .replace("    FACTOR\n", FACTOR)
-)
 
 CONSTANTS = {
+    "BRIGHTEST": float(BRIGHTEST),
     "MIN_NORM2": float(MIN_QUAT_NORM2),
     "UNIT": float(UNIT),
     "LOG2_E": float(LOG2_E),
@@ -276,13 +232,15 @@ CONSTANTS = {
 }
 
 
-@wp.func_native(snippet(PROJECT, **CONSTANTS))
+@wp.func_native(snippet(columns(1, 3, 4) + HELD + by_groups(PROJECT, FINISH, count="means.shape[0]"), **CONSTANTS))
 def project_group(
-    group: int,
+    block: int,
     means: wp.array[wp.vec3],
     quats: wp.array[wp.vec4],
     scales: wp.array[wp.vec3],
     opacities: wp.array[float],
+    sh: wp.array2d[wp.vec3],
+    degree: int,
     camera: Pinhole,
     knobs: Knobs,
     splats_out: wp.array[Splat],
@@ -294,77 +252,32 @@ def project_group(
 @wp.kernel
 def project_groups(
     # In:
-    base: int,  # first group of 16 of this launch
+    base: int,  # first GROUP of this launch
     means: wp.array[wp.vec3],  # [N] centres [m]
     quats: wp.array[wp.vec4],  # [N] rotations (w, x, y, z)
     scales: wp.array[wp.vec3],  # [N] standard deviations [m]
     opacities: wp.array[float],  # [N]
+    sh: wp.array2d[wp.vec3],  # [N, K] coefficients; or empty
+    degree: int,  # of the colours, -1 = none
     camera: Pinhole,
     knobs: Knobs,
     # Out:
-    splats_out: wp.array[Splat],  # [N] valid where visible
+    splats_out: wp.array[Splat],  # [N] valid where visible, with colours if asked for
     status_out: wp.array[wp.uint8],  # [N] VISIBLE or why not
     depths_out: wp.array[float],  # [N] z in the camera frame [m], where visible
 ):
-    """Project 16 Gaussians (paper eq. 2, 3) and decide whether any pixel can see them."""
-    project_group(base + wp.tid(), means, quats, scales, opacities, camera, knobs, splats_out, status_out, depths_out)
-
-
-@wp.func_native(snippet(BACKWARD, **CONSTANTS))
-def project_group_backward(
-    group: int,
-    means: wp.array[wp.vec3],
-    quats: wp.array[wp.vec4],
-    scales: wp.array[wp.vec3],
-    opacities: wp.array[float],
-    camera: Pinhole,
-    knobs: Knobs,
-    sums: wp.array2d[float],
-    at_depth: int,
-    means_out: wp.array[wp.vec3],
-    quats_out: wp.array[wp.vec4],
-    scales_out: wp.array[wp.vec3],
-    opacities_out: wp.array[float],
-    means2d_out: wp.array[wp.vec2],
-    poses_out: wp.array2d[float],
-): ...
-
-
-@wp.kernel
-def project_groups_backward(
-    # In:
-    base: int,  # first group of 16 of this launch
-    means: wp.array[wp.vec3],  # [N] centres [m]
-    quats: wp.array[wp.vec4],  # [N] rotations (w, x, y, z)
-    scales: wp.array[wp.vec3],  # [N] standard deviations [m]
-    opacities: wp.array[float],  # [N]
-    camera: Pinhole,
-    knobs: Knobs,
-    sums: wp.array2d[float],  # [N, 16] as `project_backward` reads them
-    at_depth: int,  # column of `sums` with the gradient of the depth, -1 = none
-    # Out:
-    means_out: wp.array[wp.vec3],  # [N] zero where no tile was reached, as all that follow
-    quats_out: wp.array[wp.vec4],  # [N]
-    scales_out: wp.array[wp.vec3],  # [N]
-    opacities_out: wp.array[float],  # [N]
-    means2d_out: wp.array[wp.vec2],  # [N] gradient of the projected centres [1 / pixels]
-    poses_out: wp.array2d[float],  # [N, POSE_COLUMNS] each Gaussian's share of the pose's gradient, or empty
-):
-    """Differentiate `project_groups`."""
-    project_group_backward(
+    """Project a few times 16 Gaussians (paper eq. 2, 3) and decide whether any pixel can see them."""
+    project_group(
         base + wp.tid(),
         means,
         quats,
         scales,
         opacities,
+        sh,
+        degree,
         camera,
         knobs,
-        sums,
-        at_depth,
-        means_out,
-        quats_out,
-        scales_out,
-        opacities_out,
-        means2d_out,
-        poses_out,
+        splats_out,
+        status_out,
+        depths_out,
     )

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import itertools
 import math
+import mmap
 import os
 import re
 import sys
@@ -374,9 +375,24 @@ def scratch(name: str, count: int, dtype: torch.dtype, device: torch.device) -> 
     held = store.get(key)
     if held is None or held.numel() < count:
         with torch.inference_mode(False):  # a tensor made under it could never be written to outside again
-            held = torch.empty(max(count + count // 4, 1), dtype=dtype, device=device)
+            held = _scratch_memory(max(count + count // 4, 1), dtype, device)
         store[key] = held
     return held[:count]
+
+
+HUGE = 2 * 2**20  # bytes of a large page; smaller scratch lies in ordinary ones
+
+
+def _scratch_memory(count: int, dtype: torch.dtype, device: torch.device) -> Tensor:
+    """Uninitialised; on Linux in large pages, if it fills some: kernels jump about in it, and pages are looked up."""
+    size = count * dtype.itemsize
+    if device.type != "cpu" or size < HUGE or not hasattr(mmap, "MADV_HUGEPAGE"):
+        return torch.empty(count, dtype=dtype, device=device)
+    memory = mmap.mmap(-1, size + HUGE)
+    with suppress(OSError):  # a kernel without them
+        memory.madvise(mmap.MADV_HUGEPAGE)
+    start = -np.frombuffer(memory, np.uint8).ctypes.data % HUGE
+    return torch.frombuffer(memory, dtype=dtype, count=count, offset=start)
 
 
 def counters(count: int, device: torch.device) -> Tensor:
@@ -393,7 +409,7 @@ def counters(count: int, device: torch.device) -> Tensor:
     return held
 
 
-LARGE = 32 * 2**20  # the C library maps what is larger anew each time, and the system clears every page
+LARGE = 4 * 2**20  # what is larger pays for pages: cleared anew each time, or small ones to look up
 MAX_IDLE = 2  # large images that are kept for the next one of their size
 
 
@@ -413,7 +429,7 @@ def fresh(*shape: int, device: torch.device) -> Tensor:
     if device.type != "cpu" or 4 * count <= LARGE:
         return torch.empty(shape, device=device)
     owner = _left_over(count)
-    return _lend(np.empty(count, dtype=np.float32) if owner is None else owner, shape)
+    return _lend(_scratch_memory(count, torch.float32, device).numpy() if owner is None else owner, shape)
 
 
 def _left_over(count: int) -> np.ndarray | None:

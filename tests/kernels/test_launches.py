@@ -60,7 +60,9 @@ def everything_that_has_kernels(monkeypatch) -> None:
         torch.randn(COUNT, 16, 3, generator=g),
     )
     shape = scene.means, scene.quats, scene.scales, scene.opacities
-    for what in ({"sh": scene.sh, "expected_depth": True}, {"features": torch.rand(COUNT, CHANNELS, generator=g)}):
+    rich = {"sh": scene.sh, "means2d": torch.zeros(COUNT, 2, requires_grad=True), "absgrad": True}
+    features = {"features": torch.rand(COUNT, CHANNELS, generator=g)}
+    for what in ({"sh": scene.sh, "expected_depth": True}, rich, features):
         leaves = [tensor.clone().requires_grad_() for tensor in shape]
         pose = torch.eye(4).requires_grad_()
         sg.rasterize(*leaves, pose, camera.K, 64, 48, **what).features.sum().backward()

@@ -4,9 +4,11 @@ import pytest
 import torch
 import warp as wp
 
+from sgwarp.kernels.native import GROUP
 from sgwarp.kernels.projection import backward as projection_backward
 from sgwarp.kernels.projection import forward as projection
 from sgwarp.kernels.projection import lanes as projection_lanes
+from sgwarp.kernels.projection import lanes_backward as projection_lanes_backward
 from sgwarp.ops.launcher import launch, view
 from sgwarp.ops.splatting import tiles
 from sgwarp.ops.splatting.settings import RasterSettings
@@ -51,17 +53,18 @@ CASES = [
 ]
 
 
-def inputs(scene: Gaussians, settings: RasterSettings) -> list:
+def inputs(scene: Gaussians, settings: RasterSettings, degree: int | None = None) -> list:
     arrays = [view(scene.means, wp.vec3), view(scene.quats, wp.vec4), view(scene.scales, wp.vec3)]
-    return [*arrays, view(scene.opacities, wp.float32), tiles.pinhole(camera()), tiles.knobs(settings)]
+    arrays += [view(scene.opacities, wp.float32)] + ([] if degree is None else [view(scene.sh, wp.vec3), degree])
+    return [*arrays, tiles.pinhole(camera()), tiles.knobs(settings)]
 
 
-def project(scene: Gaussians, settings: RasterSettings, kernel: wp.Kernel, count: int):
+def project(scene: Gaussians, settings: RasterSettings, kernel: wp.Kernel, count: int, degree: int | None = None):
     n = len(scene)
     memory, status = torch.zeros(16 * n, dtype=torch.int32), torch.zeros(n, dtype=torch.uint8)
     depths = torch.zeros(n)
     outputs = [tiles.as_splats(memory), view(status, wp.uint8), view(depths, wp.float32)]
-    launch(kernel, count, inputs(scene, settings), outputs, device=CPU)
+    launch(kernel, count, inputs(scene, settings, degree), outputs, device=CPU)
     return memory.view(torch.float32).view(n, 16)[:, : len(FIELDS)], status, depths
 
 
@@ -71,8 +74,8 @@ def test_splats(case, antialiased):
     scene, settings = cloud(*case), RasterSettings(antialiased=antialiased)
     n = len(scene)
     one, status, depths = project(scene, settings, projection.project_gaussians, n)
-    groups = -(-n // projection_lanes.GROUP)
-    many, status_16, depths_16 = project(scene, settings, projection_lanes.project_groups, groups)
+    groups = -(-n // GROUP)
+    many, status_16, depths_16 = project(scene, settings, projection_lanes.project_groups, groups, -1)
     # At a threshold rounding may decide; it does not here.
     assert torch.equal(status, status_16)
     if n > 1000:
@@ -98,7 +101,7 @@ def test_gradients(case, antialiased, pose, at_depth):
     results = []
     kernels = [
         (projection_backward.project_backward, n),
-        (projection_lanes.project_groups_backward, -(-n // projection_lanes.GROUP)),
+        (projection_lanes_backward.project_groups_backward, -(-n // GROUP)),
     ]
     for kernel, count in kernels:
         shapes = ((n, 3), (n, 4), (n, 3), (n,), (n, 2), (n if pose else 0, projection_backward.POSE_COLUMNS))
@@ -116,3 +119,43 @@ def test_gradients(case, antialiased, pose, at_depth):
         one, many = one.view(n, -1), many.view(n, -1)
         error = (many - one).abs().amax(dim=1) / one.abs().amax(dim=1).clamp(min=1e-6)
         assert float(error.max()) < 2e-3
+
+
+@pytest.mark.parametrize(("coefficients", "degree"), [(1, 0), (4, 1), (9, 2), (16, 3), (16, 1)])
+@pytest.mark.parametrize("case", CASES, ids=str)
+def test_colors_on_the_way(case, coefficients, degree):
+    """Those of `evaluate_harmonics` for what is visible; a coefficient in use that is not finite hides its Gaussian."""
+    scene, settings = cloud(*case), RasterSettings()
+    n, g = len(scene), torch.Generator().manual_seed(2)
+    sh = torch.randn(n, coefficients, 3, generator=g)
+    broken = torch.rand(n, generator=g) < 0.1
+    spots = torch.randint(3 * coefficients, (n,), generator=g)
+    bad = torch.tensor([torch.nan, torch.inf, -torch.inf])[torch.arange(n) % 3]
+    sh.view(n, -1)[broken, spots[broken]] = bad[broken]
+    sh[torch.arange(n) % 7 == 0] *= 3e38  # large, where not infinite
+    scene = Gaussians.unchecked(scene.means, scene.quats, scene.scales, scene.opacities, sh)
+    groups = -(-n // GROUP)
+    _, status, _ = project(scene, settings, projection_lanes.project_groups, groups, -1)
+    memory, status_out = torch.zeros(16 * n, dtype=torch.int32), torch.zeros(n, dtype=torch.uint8)
+    outputs = [tiles.as_splats(memory), view(status_out, wp.uint8), view(torch.zeros(n), wp.float32)]
+    launch(projection_lanes.project_groups, groups, inputs(scene, settings, degree), outputs, device=CPU)
+    usable = torch.isfinite(sh[:, : (degree + 1) ** 2]).flatten(1).all(dim=1)
+    seen = status == int(projection.VISIBLE)
+    hidden = torch.full_like(status, int(projection.NON_FINITE))
+    assert torch.equal(status_out, torch.where(seen & ~usable, hidden, status))
+    order = (seen & usable).nonzero().flatten().to(torch.int32)
+    colors = memory.view(torch.float32).view(n, 16)[order.long(), 13:]
+    torch.testing.assert_close(colors, tiles.shade(scene, camera(), order, degree), rtol=1e-5, atol=1e-5)
+
+
+@pytest.mark.parametrize("n", [0, 1, 5000])
+def test_depth_order(n):
+    """By depth, those at the same depth by index; whatever sign, however near."""
+    g = torch.Generator().manual_seed(3)
+    depths = torch.randn(n, generator=g) * 10.0 ** torch.randint(-30, 30, (n,), generator=g)
+    depths[: n // 2] = depths[: n // 2].sign() * torch.randint(1, 9, (n // 2,), generator=g)
+    status = torch.randint(0, 3, (n,), generator=g).to(torch.uint8)
+    projected = tiles.Projected(tiles.as_splats(torch.zeros(16 * n, dtype=torch.int32)), status, depths)
+    order = tiles.depth_order(projected).clone()
+    expected = sorted((depth, i) for i, depth in enumerate(depths.tolist()) if status[i] == int(projection.VISIBLE))
+    assert order.tolist() == [i for _, i in expected]

@@ -89,14 +89,15 @@ FIGURES = [
     ),
     ("binning.py", "TILE", "owns a {} x {} tile"),
     ("transmittance.py", "LANES", "the {} pixels of a row are one vector"),
-    ("projection/lanes.py", "GROUP", "takes {} Gaussians to a vector"),
+    ("native.py", "GROUP", "take 16 Gaussians to a vector, {} to a thread"),
     ("blocks.py", "BLOCK", "{} threads own a tile"),
+    ("binning_lanes.py", "PATCH", "patches of {} x {} tiles"),
     ("native.py", "BATCH", "`batch` [slots, {}] splats"),
     ("compositing/lanes_features.py", "PASS", "`features` [N, S, 1] of {} channels"),
     ("lifting/shared.py", "MAX_IDS", "`tile_ids` [tiles, {}]"),
     ("sparse/convolution_lanes.py", "COLUMNS", "C_out / {}, C_in, {}] flat"),
     ("sparse/convolution_lanes.py", "GRADIENT_GROUP", "groups of {} C_in"),
-    ("binning_lanes.py", "SPANS", "first four tile rows"),
+    ("binning_lanes.py", "SPANS", "first {} tile rows"),
 ]
 
 

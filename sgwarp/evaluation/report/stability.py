@@ -14,7 +14,8 @@ from sgwarp.evaluation.report.oracle import decidable
 from sgwarp.ops.reference import rasterizer as reference
 from sgwarp.ops.splatting import tiles
 from sgwarp.ops.splatting.autograd import rasterize
-from sgwarp.ops.splatting.forward import composite
+from sgwarp.ops.splatting.forward import composite, packed_colors
+from sgwarp.ops.splatting.plan import plan_render
 from sgwarp.ops.splatting.settings import RasterSettings
 from sgwarp.scene import Camera, Gaussians
 
@@ -135,9 +136,10 @@ def _render(
 ) -> tuple[Tensor, Tensor, Tensor, Tensor, dict[str, int]]:
     """Colour, opacity, expected and surface depth on the CPU, and what was culled; `rasterize` in a given schedule."""
     settings = RasterSettings()
-    projected = tiles.project(gaussians, camera, settings)
+    plan = plan_render(gaussians, look=False)
+    projected = tiles.project(gaussians, camera, settings, degree=plan.colored)
     order = tiles.depth_order(projected)
-    lists = tiles.bin_splats(projected, order, tiles.shade(gaussians, camera, order, gaussians.sh_degree), camera)
+    lists = tiles.bin_splats(projected, order, packed_colors(gaussians, camera, None, order, plan), camera)
     image, transmittance, depth_sum, surface = composite(lists, camera, settings, None, True, schedule)
     image, transmittance, depth_sum, surface = (t.cpu() for t in (image, transmittance, depth_sum, surface))
     alpha = 1.0 - transmittance

@@ -18,6 +18,7 @@ from torch import Tensor
 
 from sgwarp.errors import InputError
 from sgwarp.kernels import binning
+from sgwarp.kernels.binning_lanes import PATCH
 from sgwarp.kernels.gaussian import LEVEL_SLACK
 from sgwarp.kernels.projection.forward import TRANSPARENT
 from sgwarp.ops.launcher import launch, view
@@ -136,7 +137,7 @@ class _CompositeSplats(torch.autograd.Function):
         else:
             order = tiles.depth_order(projected)
             colors = _padded(values[order.to(torch.int64)]) if values.shape[1] <= 3 else None
-            lists = tiles.bin_splats(projected, order, colors, camera, places=keep, keep=keep)
+            lists = tiles.bin_splats(projected, order, colors, camera, places=keep, rows=keep, keep=keep)
         job.lists = lists
         if not keep:
             image, transmittance, depth_sum, _ = composite(lists, camera, settings, values, job.wants_depth)
@@ -264,4 +265,32 @@ def _follow(given: ListedSplats, projected: tiles.Projected, values: Tensor, cam
         torch.arange(grid, dtype=torch.int32, device=device), given.offsets.diff(), output_size=n
     )
     offsets = given.offsets.to(torch.int32).contiguous()
-    return tiles.TileLists(order, memory, offsets, listed, entries, places.to(torch.int32), owners[places])
+    row_places, ranges = _rows_of_sums(listed, owners, count, -(-camera.width // TILE))
+    return tiles.TileLists(
+        order, memory, offsets, listed, entries, places.to(torch.int32), owners[places], row_places, ranges
+    )
+
+
+def _rows_of_sums(listed: Tensor, owners: Tensor, count: int, columns: int) -> tuple[Tensor, Tensor]:
+    """`row_places` and `row_ranges` of lists: a row for each patch of the rectangle that a splat's tiles span.
+
+    Args:
+        listed: Splat of each place, int32 [I].
+        owners: Tile of each place, int32 [I].
+        count: How many splats there are.
+        columns: Of tiles in the image.
+    """
+    splats = listed.to(torch.int64)
+    spans = []
+    for patch in (owners // columns // PATCH, owners % columns // PATCH):
+        first = torch.full((count,), columns + 2**20, dtype=torch.int32, device=listed.device)
+        last = torch.full_like(first, -1)
+        first.scatter_reduce_(0, splats, patch, "amin")
+        last.scatter_reduce_(0, splats, patch, "amax")
+        spans.append((first.where(last >= 0, 0), (last - first + 1).where(last >= 0, 0)))
+    (above, down), (left, across) = spans
+    rows = down * across
+    ends = rows.cumsum(0, dtype=torch.int32)
+    starts = torch.nn.functional.pad(ends, (1, 0))
+    places = torch.stack([starts[:-1] - above * across - left, across], dim=1)
+    return places, torch.stack([starts, torch.nn.functional.pad(rows, (0, 1))], dim=1)

@@ -11,7 +11,13 @@ from torch import Tensor
 from sgwarp.errors import InputError
 from sgwarp.ops.planar.harmonics import harmonic_colors
 from sgwarp.ops.splatting import backward, forward, tiles
-from sgwarp.ops.splatting.forward import Rendering, composite_recorded, packed_colors, require_finite_features
+from sgwarp.ops.splatting.forward import (
+    Rendering,
+    composite_recorded,
+    packed_colors,
+    require_finite_features,
+    runs_in_blocks,
+)
 from sgwarp.ops.splatting.loading import load_rendering
 from sgwarp.ops.splatting.plan import RenderPlan, plan_render
 from sgwarp.ops.splatting.room import ListRoom
@@ -243,11 +249,21 @@ class _Rasterize(torch.autograd.Function):
                 backward=True,
                 absolute=request.receives_absgrad is not None,
             )
-        projected = tiles.project(gaussians, camera, settings)
+        projected = tiles.project(gaussians, camera, settings, degree=request.plan.colored, look=False)
         tiles.leave_out_non_finite(projected, features)
         order = tiles.depth_order(projected)
         colors = packed_colors(gaussians, camera, features, order, request.plan)
-        lists = tiles.bin_splats(projected, order, colors, camera, places=True, keep=True, room=request.room)
+        block = runs_in_blocks(means.device, request.schedule)
+        lists = tiles.bin_splats(
+            projected,
+            order,
+            colors,
+            camera,
+            places=block or values.shape[1] > 3,
+            rows=not block,
+            keep=True,
+            room=request.room,
+        )
         image, transmittance, depth_sum, surface, last, hit = composite_recorded(
             lists, camera, settings, features, request.plan.depth, request.schedule
         )
@@ -275,30 +291,34 @@ class _Rasterize(torch.autograd.Function):
         means, quats, scales, opacities, values, world_to_camera, *kept = ctx.saved_tensors
         gaussians = _gaussians(means, quats, scales, opacities, values, request)
         recorded, lists = (kept[0], kept[1], kept[2]), tiles.TileLists(*kept[3:])
-        splats = backward.composite_backward(
-            lists,
-            camera,
-            settings,
-            None if request.harmonics else values,
-            ctx.channels,
-            recorded,
-            backward.ImageGradients(v_image, v_transmittance, v_depth_sum, v_surface),
-            len(means),
-            absolute=request.receives_absgrad is not None,
-            schedule=request.schedule,
-            deterministic=request.deterministic,
-        )
-        pose = ctx.needs_input_grad[5]
-        result = backward.project_backward(gaussians, camera, settings, splats, pose=pose)
-        v_values, v_offsets = splats.features, None
-        if request.harmonics:
-            degree = request.plan.sh_degree
-            v_values, v_offsets = backward.shade_backward(gaussians, camera, splats, result.means, degree, pose=pose)
+        gradients = backward.ImageGradients(v_image, v_transmittance, v_depth_sum, v_surface)
+        pose, absolute, degree = ctx.needs_input_grad[5], request.receives_absgrad is not None, request.plan.sh_degree
+        features = None if request.harmonics else values
+        compositing = (lists, camera, settings, features, ctx.channels, recorded, gradients)
+        if request.harmonics and len(lists.row_ranges) and v_surface is None and not absolute:
+            replayed = backward.replay(*compositing)
+            result, v_values, v_offsets = backward.differentiate(
+                gaussians, camera, settings, replayed, degree, pose=pose, centres=ctx.needs_input_grad[6]
+            )
+        else:
+            splats = backward.composite_backward(
+                *compositing,
+                len(means),
+                absolute=absolute,
+                schedule=request.schedule,
+                deterministic=request.deterministic,
+            )
+            result = backward.project_backward(gaussians, camera, settings, splats, pose=pose)
+            v_values, v_offsets = splats.features, None
+            if request.harmonics:
+                v_values, v_offsets = backward.shade_backward(
+                    gaussians, camera, splats, result.means, degree, pose=pose
+                )
+            if request.receives_absgrad is not None:
+                _accumulate(request.receives_absgrad, splats.absolute)
         v_world_to_camera = (
             backward.pose_gradient(camera, result.poses, v_offsets).to(world_to_camera) if pose else None
         )
-        if request.receives_absgrad is not None:
-            _accumulate(request.receives_absgrad, splats.absolute)
         return (
             result.means,
             result.quats,

@@ -100,7 +100,7 @@ def rasterize(
         load_rendering(gaussians.device, harmonics=plan.values == "colors", depth=plan.depth)
     else:
         load_wide_rendering(gaussians.device, channels, depth=plan.depth)
-    projected = tiles.project(gaussians, camera, settings)
+    projected = tiles.project(gaussians, camera, settings, degree=plan.colored)
     tiles.leave_out_non_finite(projected, features)
     order = tiles.depth_order(projected)
     colors = packed_colors(gaussians, camera, features, order, plan)
@@ -132,11 +132,14 @@ def require_finite_features(features: Tensor) -> None:
 def packed_colors(
     gaussians: Gaussians, camera: Camera, features: Tensor | None, order: Tensor, plan: RenderPlan
 ) -> Tensor | None:
-    """Colours by depth order. Three channels travel with the splats; more are gathered while compositing."""
+    """Colours by depth order, unless the projection gave them to the splats, as it does with harmonics on the CPU.
+
+    Three channels travel with the splats; more are gathered while compositing.
+    """
     if plan.values == "nothing":
         return None
     if features is None:
-        return tiles.shade(gaussians, camera, order, plan.sh_degree)
+        return tiles.shade(gaussians, camera, order, plan.sh_degree) if order.is_cuda else None
     if features.shape[1] > 3:
         return None
     padded = torch.zeros(len(order), 3, dtype=torch.float32, device=gaussians.device)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import torch
 import warp as wp
 
-from sgwarp.kernels import binning_lanes
+from sgwarp.kernels import binning_lanes, ordering_lanes
 from sgwarp.kernels.lifting import lanes, lanes_wide, shared
 from sgwarp.kernels.projection import lanes as projection_lanes
 from sgwarp.kernels.transmittance import LANES
@@ -36,4 +36,5 @@ def lifting_kernels(channels: int, *, ids: bool, squared: bool) -> list[wp.Kerne
         kernels += [lanes_wide.sum_tiles, *(lanes.make_lift_dense(1, squared) for _ in pass_widths(channels)[1:])]
     else:
         kernels = [lanes.make_lift_dense(width, squared) for width in pass_widths(channels)]
-    return [*kernels, projection_lanes.project_groups, shared.sum_rows, binning_lanes.count_tiles]
+    kernels += [projection_lanes.project_groups, ordering_lanes.sort_depths, binning_lanes.count_tiles]
+    return [*kernels, shared.sum_rows]

@@ -5,14 +5,14 @@ from __future__ import annotations
 import torch
 import warp as wp
 
-from sgwarp.kernels import binning_lanes
+from sgwarp.kernels import binning_lanes, ordering_lanes
 from sgwarp.kernels.compositing.lanes import make_composite_colors
 from sgwarp.kernels.compositing.lanes_backward import make_composite_backward
 from sgwarp.kernels.compositing.lanes_features import make_composite_features
 from sgwarp.kernels.compositing.lanes_sums import sum_used_rows
-from sgwarp.kernels.harmonics.backward import harmonics_backward
-from sgwarp.kernels.harmonics.forward import evaluate_harmonics
+from sgwarp.kernels.harmonics.lanes import shade_groups_backward
 from sgwarp.kernels.projection import lanes as projection_lanes
+from sgwarp.kernels.projection.lanes_backward import differentiate_groups, project_groups_backward
 from sgwarp.kernels.transmittance import LANES
 from sgwarp.ops.launcher import load_together
 
@@ -47,15 +47,20 @@ def rendering_kernels(
     """Kernels of `load_rendering`, one of each module."""
     colors = make_composite_colors(depth, backward)
     needed: list[wp.Kernel] = [make_composite_backward(False, depth, absolute)] * backward
-    # Both kernels of the projection are in one module.
-    needed += [projection_lanes.project_groups, colors] + [evaluate_harmonics] * harmonics + [binning_lanes.count_tiles]
-    return needed + [sum_used_rows] * backward + [harmonics_backward] * (harmonics and backward)
+    needed += [projection_lanes.project_groups, ordering_lanes.sort_depths, binning_lanes.count_tiles, colors]
+    if harmonics and not absolute:
+        return needed + [differentiate_groups] * backward
+    return (
+        needed
+        + [sum_used_rows, project_groups_backward] * backward
+        + [shade_groups_backward] * (harmonics and backward)
+    )
 
 
 def wide_rendering_kernels(channels: int, *, depth: bool) -> list[wp.Kernel]:
     """Kernels of `load_wide_rendering`."""
     needed: list[wp.Kernel] = [make_composite_features(width, False) for width in pass_widths(channels)]
-    needed += [projection_lanes.project_groups, binning_lanes.count_tiles]
+    needed += [projection_lanes.project_groups, ordering_lanes.sort_depths, binning_lanes.count_tiles]
     return needed + [make_composite_colors(True, False)] * depth
 
 

@@ -34,6 +34,11 @@ class RenderPlan:
     record: bool
     left_out: tuple[tuple[str, int], ...]
 
+    @property
+    def colored(self) -> int | None:
+        """Up to which degree colours of harmonics are composited; None if none are."""
+        return self.sh_degree if self.values == "colors" else None
+
     def __str__(self) -> str:
         what = {
             "colors": f"colours, harmonics of degree {self.sh_degree}",

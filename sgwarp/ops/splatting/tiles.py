@@ -12,9 +12,10 @@ import warp as wp
 from torch import Tensor
 
 from sgwarp.errors import InputError
-from sgwarp.kernels import binning, binning_lanes
+from sgwarp.kernels import binning, binning_lanes, ordering_lanes
 from sgwarp.kernels.gaussian import Pinhole, Splat
 from sgwarp.kernels.harmonics import forward as harmonics
+from sgwarp.kernels.native import GROUP
 from sgwarp.kernels.projection import forward as projection
 from sgwarp.kernels.projection import lanes as projection_lanes
 from sgwarp.ops.launcher import launch, launch_plain, scratch, sort_pairs, view, warp_device
@@ -54,7 +55,7 @@ class TileLists:
     """Tile lists of one view; scratch memory, valid until the next view unless kept.
 
     A place is a position in the lists, an entry an intersection (one splat in one tile) counted splat by splat, a rank
-    a place in the depth order.
+    a place in the depth order. A row of sums belongs to a splat in a patch of tiles (`kernels/binning_lanes.py`).
     """
 
     order: Tensor  # int32 [V] Gaussians by (depth, index)
@@ -64,6 +65,8 @@ class TileLists:
     entries: Tensor  # int32 [V + 1] first entry of each rank
     places: Tensor  # int32 [I] place of each entry; empty unless asked for
     tiles: Tensor  # int32 [I] tile of each entry; empty unless asked for
+    row_places: Tensor  # int32 [V, 2] where the rows of sums of each rank are; empty unless asked for, as what follows
+    row_ranges: Tensor  # int32 [N + 1, 2] first row of sums of each Gaussian and their number; last: of all
 
     @property
     def tile_count(self) -> int:
@@ -149,8 +152,22 @@ def knobs(settings: RasterSettings) -> projection.Knobs:
     return device
 
 
-def project(gaussians: Gaussians, camera: Camera, settings: RasterSettings) -> Projected:
-    """Project every Gaussian."""
+def project(
+    gaussians: Gaussians,
+    camera: Camera,
+    settings: RasterSettings,
+    *,
+    degree: int | None = None,
+    look: bool = True,
+) -> Projected:
+    """Project every Gaussian.
+
+    Args:
+        gaussians, camera, settings: What is seen.
+        degree: On the CPU also evaluate the harmonics of what is visible, up to this degree.
+        look: On the CPU look once per scene whether some coefficient is not finite. Without it only those are looked
+            at that are evaluated: of what is hidden and not finite the status says why it is hidden.
+    """
     n, device = len(gaussians), gaussians.device
     splats = as_splats(splat_memory(n, device, "splats"))
     status = scratch("status", n, torch.uint8, device)
@@ -160,18 +177,19 @@ def project(gaussians: Gaussians, camera: Camera, settings: RasterSettings) -> P
         view(gaussians.quats, wp.vec4),
         view(gaussians.scales, wp.vec3),
         view(gaussians.opacities, wp.float32),
-        pinhole(camera),
-        knobs(settings),
     ]
+    seen_by = [pinhole(camera), knobs(settings)]
     outputs = [splats, view(status, wp.uint8), view(depths, wp.float32)]
     if device.type == "cuda":
-        launch(projection.project_gaussians, n, inputs, outputs, device=device)
-    else:
-        launch(projection_lanes.project_groups, -(-n // projection_lanes.GROUP), inputs, outputs, device=device)
-    # The kernel reads geometry and opacity only. On CUDA it is cheaper to look at all than to wait for the answer.
-    if device.type == "cuda":
+        # The kernel reads geometry and opacity only. It is cheaper to look at all colours than to wait for an answer.
+        launch(projection.project_gaussians, n, [*inputs, *seen_by], outputs, device=device)
         mark_non_finite_colors(gaussians.sh, status)
-    elif gaussians.colors_may_be_non_finite:
+        return Projected(splats, status, depths)
+    read = -1 if degree is None else degree
+    inputs += [view(gaussians.sh, wp.vec3), read, *seen_by]
+    launch(projection_lanes.project_groups, -(-n // GROUP), inputs, outputs, device=device)
+    # The kernel left out those whose coefficients it read are not finite. There may be others.
+    if (look or (read + 1) ** 2 < gaussians.sh.shape[1]) and gaussians.colors_may_be_non_finite:
         status.masked_fill_(~gaussians.finite, int(projection.NON_FINITE))
     return Projected(splats, status, depths)
 
@@ -195,14 +213,12 @@ def depth_order(projected: Projected) -> Tensor:
     if device.type == "cuda":
         shown = torch.where(projected.status == projection.VISIBLE, projected.depths, math.inf)
         return shown.argsort(stable=True).to(torch.int32)
-    visible = (projected.status == projection.VISIBLE).nonzero().flatten().to(torch.int32)
-    count = len(visible)
-    keys = scratch("depth keys", 2 * count, torch.float32, device)
-    order = scratch("order", 2 * count, torch.int32, device)
-    torch.index_select(projected.depths, 0, visible, out=keys[:count])
-    order[:count] = visible
-    sort_pairs(keys, order, count, wp.float32)
-    return order[:count]
+    n = len(projected.status)
+    pairs, order = scratch("depth pairs", 2 * n, torch.int64, device), scratch("order", n, torch.int32, device)
+    count = torch.empty(1, dtype=torch.int32, device=device)
+    inputs = [view(projected.status, wp.uint8), view(projected.depths, wp.float32), view(pairs, wp.uint64)]
+    launch(ordering_lanes.sort_depths, 1, inputs, [view(order, wp.int32), view(count, wp.int32)], device=device)
+    return order[: int(count)]
 
 
 def shade(gaussians: Gaussians, camera: Camera, order: Tensor, degree: int) -> Tensor:
@@ -219,14 +235,18 @@ def shade(gaussians: Gaussians, camera: Camera, order: Tensor, degree: int) -> T
     return colors
 
 
-def _first_places(counts: Tensor, limit: int = MAX_INTERSECTIONS) -> tuple[Tensor, int]:
+def _first_places(counts: Tensor, limit: int) -> tuple[Tensor, int]:
     """Exclusive prefix sum with the total at the end, int32 [n + 1], and the total."""
     places = torch.zeros(len(counts) + 1, dtype=torch.int64, device=counts.device)
     torch.cumsum(counts, 0, out=places[1:])
     total = int(places[-1])  # the one host synchronisation of the render path on CUDA: it sizes the lists
+    _check_total(total, limit)
+    return places.to(torch.int32), total
+
+
+def _check_total(total: int, limit: int) -> None:
     if total > limit:
         raise InputError(f"{total} tile intersections exceed {limit}; render at a lower resolution or fewer Gaussians")
-    return places.to(torch.int32), total
 
 
 def bin_splats(
@@ -237,14 +257,15 @@ def bin_splats(
     *,
     places: bool = False,
     tiles: bool = False,
+    rows: bool = False,
     keep: bool = False,
     room: ListRoom | None = None,
 ) -> TileLists:
     """Write the tile lists of a view.
 
-    `colors` [V, 3] travel with the splats; `places` and `tiles` of the entries are filled only if asked for. With
-    `keep` the lists have memory of their own: they outlive the view, as a backward pass needs it. On CUDA nobody waits
-    for the length of the lists if they are given a `room`.
+    `colors` [V, 3] travel with the splats; `places` and `tiles` of the entries and the `rows` of sums, on the CPU, are
+    filled only if asked for. With `keep` the lists have memory of their own: they outlive the view, as a backward pass
+    needs it. On CUDA nobody waits for the length of the lists if they are given a `room`.
     """
     device = order.device
     packed = view(colors, wp.vec3) if colors is not None else wp.empty(0, dtype=wp.vec3, device=warp_device(device))
@@ -252,7 +273,7 @@ def bin_splats(
     order = order.clone() if keep else order
     if device.type == "cuda":
         return bin_by_sorting(projected, order, packed, camera, memory, keep=keep, room=room)
-    lists = bin_by_counting(projected, order, packed, camera, memory, places=places, tiles=tiles, keep=keep)
+    lists = bin_by_counting(projected, order, packed, camera, memory, places=places, tiles=tiles, rows=rows, keep=keep)
     if room is not None:
         room.note(lists.entries[-1].to(torch.int64))
     return lists
@@ -267,33 +288,43 @@ def bin_by_counting(
     *,
     places: bool,
     tiles: bool,
+    rows: bool,
     keep: bool,
 ) -> TileLists:
     """Count and fill in slices of the depth order (CPU)."""
     device, count, grid = order.device, len(order), _tile_count(camera)
     per_slice = max(1, -(-count // SLICES))
-    tile_counts = scratch("tile counts", SLICES * grid, torch.int32, device).view(SLICES, grid).zero_()
-    splat_counts = scratch("splat counts", count, torch.int32, device)
+    cursors = scratch("tile counts", SLICES * grid, torch.int32, device).view(SLICES, grid).zero_()
+    totals = torch.zeros(SLICES + 1, 2, dtype=torch.int64, device=device)
     sizes = [per_slice, camera.width, camera.height]
     splats = as_splats(memory)
     inputs = [view(order, wp.int32), projected.splats, colors, *sizes]
-    spans = view(scratch("spans", count, torch.int64, device), wp.uint64)
-    rows = view(scratch("tile rows", count, torch.int32, device), wp.int32)
-    outputs = [splats, view(tile_counts, wp.int32), view(splat_counts, wp.int32), spans, rows]
+    shared = [view(cursors, wp.int32), view(totals, wp.int64)]
+    words = binning_lanes.SPAN_WORDS * count
+    kept = [view(scratch("spans", words, torch.int64, device), wp.uint64)]
+    kept += [view(scratch(name, count, torch.int32, device), wp.int32) for name in ("tile rows", "tile patches")]
+    outputs = [splats, *shared, *kept]
     launch(binning_lanes.count_tiles, SLICES, inputs, outputs, device=device, chunk=1)
-    entries, total = _first_places(splat_counts)
-    # Tile by tile, and within a tile slice by slice, so that each slice continues where the one in front ended.
-    by_tile = tile_counts.t().reshape(-1)
-    cursors = (by_tile.cumsum(0, dtype=torch.int32) - by_tile).view(grid, SLICES).t().contiguous()
-    offsets = torch.cat([cursors[0], entries[-1:]])
-    listed, places_of, tiles_of = (
-        _intersections(name, total if wanted else 0, device, keep)
-        for name, wanted in (("listed", True), ("places", places), ("tiles", tiles))
+    offsets = torch.empty(grid + 1, dtype=torch.int32, device=device)
+    launch(binning_lanes.place_slices, 1, [], [*shared, view(offsets, wp.int32)], device=device)
+    total, _ = totals[-1].tolist()
+    _check_total(total, MAX_INTERSECTIONS)
+    lengths = {
+        "listed": total,
+        "entries": count + 1,
+        "places": total if places else 0,
+        "entry tiles": total if tiles else 0,
+        "row places": 2 * count if rows else 0,
+        "row ranges": 2 * (len(projected.status) + 1) if rows else 0,
+    }
+    listed, entries, places_of, tiles_of, row_places, ranges = (
+        _integers(name, length, device, keep) for name, length in lengths.items()
     )
-    outputs = [view(t, wp.int32) for t in (cursors, listed, places_of, tiles_of)]
-    inputs = [splats, *sizes, view(entries, wp.int32), spans, rows]
+    row_places, ranges = row_places.view(-1, 2), ranges.zero_().view(-1, 2)
+    inputs = [view(order, wp.int32), splats, *sizes, shared[1], *kept, shared[0]]
+    outputs = [view(t, wp.int32) for t in (listed, entries, places_of, tiles_of, row_places, ranges)]
     launch(binning_lanes.fill_tiles, SLICES, inputs, outputs, device=device, chunk=1)
-    return TileLists(order, memory, offsets, listed, entries, places_of, tiles_of)
+    return TileLists(order, memory, offsets, listed, entries, places_of, tiles_of, row_places, ranges)
 
 
 def bin_by_sorting(
@@ -320,7 +351,7 @@ def bin_by_sorting(
         entries, total = _first_places(splat_counts, MOST)
     else:
         entries, total = _places_in_room(splat_counts, room), room.size
-    listed, places_of, tiles_of = (_intersections(name, total, device, keep) for name in ("listed", "places", "tiles"))
+    listed, places_of, tiles_of = (_integers(name, total, device, keep) for name in ("listed", "places", "tiles"))
     keys = scratch("tile keys", 2 * total, torch.int32, device)
     values = scratch("tile values", 2 * total, torch.int32, device)
     ranks = scratch("tile ranks", total, torch.int32, device)
@@ -336,7 +367,8 @@ def bin_by_sorting(
     offsets = torch.searchsorted(keys[:total], edges).to(torch.int32)
     outputs = [view(listed, wp.int32), view(places_of, wp.int32)]
     launch_plain(binning.list_sorted, total, [view(values, wp.int32), view(ranks, wp.int32)], outputs, device=device)
-    return TileLists(order, memory, offsets, listed, entries, places_of, tiles_of)
+    none = order.new_empty(0, 2)
+    return TileLists(order, memory, offsets, listed, entries, places_of, tiles_of, none, none)
 
 
 def _places_in_room(counts: Tensor, room: ListRoom) -> Tensor:
@@ -351,6 +383,6 @@ def _tile_count(camera: Camera) -> int:
     return -(-camera.width // TILE) * -(-camera.height // TILE)
 
 
-def _intersections(name: str, count: int, device: torch.device, keep: bool) -> Tensor:
-    """One int32 for each of `count` intersections: scratch, or memory of its own where it is kept."""
+def _integers(name: str, count: int, device: torch.device, keep: bool) -> Tensor:
+    """`count` int32 of the lists: scratch, or memory of its own where it is kept."""
     return torch.empty(count, dtype=torch.int32, device=device) if keep else scratch(name, count, torch.int32, device)

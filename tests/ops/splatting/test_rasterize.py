@@ -115,6 +115,10 @@ def test_block_schedule_equals_lane_schedule(scene):
 def test_sorted_lists_equal_counted_lists(scene):
     """The CUDA way of binning (emit, sort, list) gives the CPU's lists."""
     _, gaussians, camera = scene
+    assert_lists_equal(gaussians, camera)
+
+
+def assert_lists_equal(gaussians: Gaussians, camera: Camera) -> None:
     projected, order, colors, counted = lists_of(gaussians, camera)
     kept = [t.clone() for t in vars(counted).values()]
     memory = torch.zeros_like(counted.memory)
@@ -122,6 +126,48 @@ def test_sorted_lists_equal_counted_lists(scene):
     by_sort = tiles.bin_by_sorting(projected, order, packed, camera, memory, keep=True)
     for name, want, got in zip(vars(counted), kept, vars(by_sort).values(), strict=True):
         assert torch.equal(want, got), name
+
+
+@pytest.mark.parametrize("size", [(170, 4200), (300, 40)])
+def test_splats_across_many_tiles_are_listed_the_same(size):
+    """Wider than eight bits hold columns of tiles, and taller than the rows that counting keeps for filling."""
+    g = torch.Generator().manual_seed(0)
+    n, (height, width) = 40, size
+    K = torch.tensor([[2000.0, 0, width / 2], [0, 2000.0, height / 2], [0, 0, 1]], dtype=torch.float64)
+    camera = Camera(K, torch.eye(4, dtype=torch.float64), width, height)
+    spread = torch.tensor([width / 1000, height / 1000, 0.5])
+    means = spread * (torch.rand(n, 3, generator=g) - 0.5) + torch.tensor([0.0, 0.0, 2.0])
+    scales = 0.08 * torch.rand(n, 3, generator=g) + 0.001
+    gaussians = Gaussians(
+        means, torch.randn(n, 4, generator=g), scales, torch.ones(n), torch.rand(n, 1, 3, generator=g)
+    )
+    assert_lists_equal(gaussians, camera)
+    _, _, _, lists = lists_of(gaussians, camera)
+    per_splat = lists.entries.diff()
+    assert int(per_splat.max()) > 20
+
+
+def test_rows_of_sums_belong_to_a_splat_in_a_patch(scene):
+    _, gaussians, camera = scene
+    projected, order, colors, lists = lists_of(gaussians, camera)
+    lists = tiles.bin_splats(projected, order, colors, camera, tiles=True, places=True, rows=True, keep=True)
+    columns, patch = -(-camera.width // 16), 4
+    offsets, ranks = lists.offsets.long(), lists.listed.long()
+    tile = torch.repeat_interleave(torch.arange(lists.tile_count), offsets.diff())
+    place = torch.stack([ranks, tile // columns // patch, tile % columns // patch], dim=1)
+    start, step = lists.row_places[ranks].long().unbind(1)
+    rows = start + step * place[:, 1] + place[:, 2]
+    # As many rows as there are pairs of a splat and a patch, and never two pairs in one row.
+    pairs, which = place.unique(dim=0, return_inverse=True)
+    owner = torch.full((int(lists.row_ranges[-1, 0]),), -1)
+    owner[rows] = which
+    assert torch.equal(owner[rows], which)
+    assert len(owner[owner >= 0].unique()) == len(pairs)
+    # The rows of a Gaussian are its own range, and the ranges follow each other.
+    first, count = lists.row_ranges[order.long()].long().unbind(1)
+    assert ((rows >= first[ranks]) & (rows < (first + count)[ranks])).all()
+    assert torch.equal(first[1:], (first + count)[:-1])
+    assert int(lists.row_ranges[:-1, 1].sum()) == len(owner)
 
 
 def least_on_tile(mean: torch.Tensor, conic: torch.Tensor, tile: int, camera: Camera) -> float:
