@@ -44,6 +44,9 @@ def test_room_is_what_is_stored_and_32_megabytes(tmp_path, monkeypatch, free, mo
 
 
 def test_where_nothing_tells_of_room_the_call_may_try(tmp_path):
+    (tmp_path / "there").mkdir()
+    with pytest.raises(InputError, match="the disk has"):
+        require_room(tmp_path / "there" / "database.db", 2**60)
     require_room(tmp_path / "missing" / "database.db", 2**60)
 
 
