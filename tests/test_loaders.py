@@ -46,6 +46,8 @@ ALLOWED = {
     # Lines that the processes of one run send each other.
     ("cluster.local", "json.loads"),
     ("cluster.worker", "json.loads"),
+    # Memory of this process in large pages, of no file.
+    ("ops.launcher", "mmap.mmap"),
 }
 
 

@@ -28,7 +28,9 @@ MOMENTS = """
 GATHER = """
     // By arithmetic, not by branches: whether a Gaussian is seen and has a second row is anybody's guess.
     const Row nothing = zero;
+    const unsigned char unused = 0;
     const auto* const all_rows = rows.shape[0] > 0 ? reinterpret_cast<const Row*>(rows.data) : &nothing;
+    const auto* const all_used = used.shape[0] > 0 ? used.data : &unused;  // nothing may be in view
     const auto fetch = [&](int i) {
         const int first_row = ranges.data[2 * i], more = ranges.data[2 * i + 1] - 1, visible = ~(more >> 31);
         const Row* const row = all_rows + first_row;
@@ -53,7 +55,7 @@ GATHER = """
         const int start = i < count ? ranges.data[2 * (first + i)] : 0;
         const int rows_here = i < count ? ranges.data[2 * (first + i) + 1] : 0;
         const auto add = [&](Row sum, int row, int there) -> Row {
-            const int taken = -(there & used.data[row]);
+            const int taken = -(there & all_used[row]);
             seen_bits |= taken & 1 << i;
             return sum + reinterpret_cast<Row>(reinterpret_cast<Ints>(all_rows[row]) & taken);
         };

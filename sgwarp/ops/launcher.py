@@ -388,7 +388,8 @@ def _scratch_memory(count: int, dtype: torch.dtype, device: torch.device) -> Ten
     size = count * dtype.itemsize
     if device.type != "cpu" or size < HUGE or not hasattr(mmap, "MADV_HUGEPAGE"):
         return torch.empty(count, dtype=dtype, device=device)
-    memory = mmap.mmap(-1, size + HUGE)
+    # Not shared, as Python's default is: a forked process would write into this one's memory.
+    memory = mmap.mmap(-1, size + HUGE, flags=mmap.MAP_PRIVATE | mmap.MAP_ANONYMOUS)
     with suppress(OSError):  # a kernel without them
         memory.madvise(mmap.MADV_HUGEPAGE)
     start = -np.frombuffer(memory, np.uint8).ctypes.data % HUGE

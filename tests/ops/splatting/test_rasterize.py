@@ -6,6 +6,7 @@ import pytest
 import torch
 import warp as wp
 
+import sgwarp as sg
 from sgwarp.errors import InputError
 from sgwarp.ops import launcher
 from sgwarp.ops.reference import rasterizer as reference
@@ -294,6 +295,28 @@ def test_empty_scene_and_nothing_in_view_give_the_background(make_scene):
         assert (got.depth == 0).all()
         wide = rasterize(scene, camera, torch.zeros(len(scene), 7))
         assert (wide.features == 0).all()
+
+
+@pytest.mark.parametrize("size", [(64, 48), (640, 480)])
+def test_what_is_not_in_view_has_gradients_of_zero(size):
+    """Nothing at all in view, after a view that showed something and left its rows in the scratch memory."""
+    width, height = size
+    values = {
+        "means": torch.rand(40, 3, generator=torch.Generator().manual_seed(0)) + torch.tensor([-0.5, -0.5, 3.0]),
+        "quats": torch.tensor([[1.0, 0, 0, 0]]).repeat(40, 1),
+        "scales": torch.full((40, 3), 0.1),
+        "opacities": torch.full((40,), 0.5),
+        "sh": torch.full((40, 4, 3), 0.1),
+    }
+    K = torch.tensor([[0.8 * width, 0, width / 2], [0, 0.8 * width, height / 2], [0, 0, 1.0]])
+    for turned, seen in ((1.0, True), (-1.0, False), (-1.0, False)):
+        tensors = {name: value.clone().requires_grad_() for name, value in values.items()}
+        pose = torch.diag(torch.tensor([turned, 1.0, turned, 1.0])).requires_grad_()
+        image = sg.rasterize(**tensors, viewmat=pose, K=K, width=width, height=height).features
+        (image.square().sum() + image.sum()).backward()
+        for tensor in (*tensors.values(), pose):
+            assert torch.isfinite(tensor.grad).all()
+            assert bool(tensor.grad.any()) == seen
 
 
 def test_inputs_are_checked(make_scene):
