@@ -6,6 +6,7 @@ tests/differences.py, are loaded by their paths, because importlib mode puts no 
 """
 
 import importlib.util
+import logging
 import sys
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
@@ -63,6 +64,16 @@ def scenes():
 def assert_central_differences():
     """Compare gradients with central differences of a float64 loss."""
     return differences.assert_central_differences
+
+
+@pytest.fixture(autouse=True)
+def notices_end_with_the_test() -> Iterator[None]:
+    """A handler that a test leaves behind would write to a stream that is closed by then."""
+    logger = logging.getLogger("sgwarp")
+    handlers, level = logger.handlers[:], logger.level
+    yield
+    logger.handlers[:] = handlers
+    logger.setLevel(level)
 
 
 @pytest.fixture

@@ -110,7 +110,16 @@ def _is_over(entry: os.DirEntry[str], machine: str, process: int) -> bool:
         return True
     except OSError:
         return False
-    return False
+    return _has_ended(process)
+
+
+def _has_ended(process: int) -> bool:
+    """Whether a process is listed only because nobody has asked how it ended, as in containers without an init."""
+    try:
+        state = Path(f"/proc/{process}/stat").read_text(encoding="utf-8", errors="replace")
+    except OSError:  # another system than Linux, or it is gone just now
+        return False
+    return state.rpartition(")")[2].split()[:1] in (["Z"], ["X"])
 
 
 def _flush(path: Path) -> None:

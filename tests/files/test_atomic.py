@@ -106,6 +106,18 @@ def test_what_a_killed_process_left_goes_at_the_next_write(tmp_path):
     assert os.listdir(tmp_path) == ["other.txt"]
 
 
+@pytest.mark.skipif(not os.path.exists("/proc/self/stat"), reason="looks for processes in /proc")
+def test_a_process_that_nobody_has_asked_how_it_ended_writes_no_more(tmp_path):
+    """As a killed one stays listed in a container whose first process takes care of none."""
+    environment = {**os.environ, "PYTHONPATH": os.pathsep.join(sys.path)}
+    process = subprocess.Popen([sys.executable, "-c", KILLED, str(tmp_path / "a.txt")], env=environment)
+    os.waitid(os.P_PID, process.pid, os.WEXITED | os.WNOWAIT)  # it has ended, and is still there
+    os.kill(process.pid, 0)
+    (left,) = tmp_path.iterdir()
+    assert atomic.leftovers(tmp_path) == [left]
+    assert process.wait() == -9
+
+
 def test_what_others_are_writing_stays(tmp_path):
     machine = atomic._machine()
     other = "0000" if machine != "0000" else "ffff"
