@@ -32,7 +32,7 @@ def probe(count: int, width: int, height: int) -> dict[str, int]:
     import scenes
     from training import step
 
-    from sgwarp.ops.launcher import release_scratch
+    from sgwarp.ops.memory import release_scratch
     from sgwarp.ops.splatting import tiles
     from sgwarp.ops.splatting.settings import RasterSettings
 

@@ -15,7 +15,7 @@ import torch
 
 from sgwarp.ops import launcher
 from sgwarp.ops.splatting import autograd as differentiable
-from sgwarp.ops.splatting import backward, tiles
+from sgwarp.ops.splatting import backward_lanes, tiles
 from sgwarp.ops.splatting import forward as rasterize
 
 Job = Callable[[], object]
@@ -28,8 +28,8 @@ STAGES: tuple[tuple[str, ModuleType, str], ...] = (
     ("bin", tiles, "bin_splats"),
     ("composite", rasterize, "composite"),
     ("composite", differentiable, "composite_recorded"),
-    ("composite backward", backward, "replay"),
-    ("Gaussians backward", backward, "differentiate"),
+    ("composite backward", backward_lanes, "replay"),
+    ("Gaussians backward", backward_lanes, "differentiate"),
 )
 # Stages of the limit that are one here.
 TOGETHER = {"project": ("project", "shade"), "Gaussians backward": ("sums", "project backward", "shade backward")}

@@ -29,7 +29,7 @@ from torch.utils._pytree import tree_leaves, tree_map
 
 import sgwarp
 import sgwarp.ops
-from sgwarp.ops import launcher
+from sgwarp.ops import launcher, memory
 
 CUDA = torch.device("cuda", 0)
 OUTSIDE = "outside the package"
@@ -397,7 +397,7 @@ def pretended_cuda() -> Iterator[PretendedDevice]:
                 yield device
         finally:
             torch.__future__.set_overwrite_module_params_on_conversion(overwrites)
-            launcher.release_scratch()
+            memory.release_scratch()
 
 
 def _pretend_torch(patch: pytest.MonkeyPatch, device: PretendedDevice) -> None:

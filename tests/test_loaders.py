@@ -47,7 +47,7 @@ ALLOWED = {
     ("cluster.local", "json.loads"),
     ("cluster.worker", "json.loads"),
     # Memory of this process in large pages, of no file.
-    ("ops.launcher", "mmap.mmap"),
+    ("ops.memory", "mmap.mmap"),
 }
 
 

@@ -1,4 +1,4 @@
-"""Launching kernels: host threads on the CPU, torch's current stream on CUDA, and reusable scratch memory.
+"""Launching kernels: host threads on the CPU, torch's current stream on CUDA; memory is in `memory.py`.
 
 A CPU launch of Warp is one serial loop that releases the interpreter lock. So a launch is cut into chunks, and host
 threads take chunks in turn; every kernel writes disjoint memory, so the result does not depend on their number.
@@ -7,20 +7,15 @@ threads take chunks in turn; every kernel writes disjoint memory, so the result 
 from __future__ import annotations
 
 import itertools
-import math
-import mmap
 import os
 import re
 import sys
 import threading
-import weakref
-from collections import deque
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager, suppress
 from typing import Any
 
-import numpy as np
 import torch
 import warp as wp
 from torch import Tensor
@@ -33,7 +28,6 @@ CHUNKS_PER_THREAD = 8  # enough to even out tiles of different cost
 MAX_THREADS = 512
 LEAST_DRIVER = 580  # of NVIDIA, that the wheels of Warp 1.19 take; they are built with CUDA 13
 SMALL = 256  # below this many threads of a launch, a second host thread costs more than it saves
-MOST_COUNTERS = 4096  # that a launch needs, as a rule
 
 
 def _init_warp() -> None:
@@ -74,14 +68,13 @@ _local = threading.local()
 
 
 def _after_fork() -> None:
-    """In a forked process: threads and locks of the parent do not exist here, its memory is a copy.
+    """In a forked process: threads and locks of the parent do not exist here.
 
     torch's own threads are gone as well, and its OpenMP would wait for them: it works with one, as in a DataLoader.
     """
     global _pool, _pool_lock, _local
     _pool, _pool_lock, _local = None, threading.Lock(), threading.local()
     _compilers.clear()
-    _idle.clear()
     torch.set_num_threads(1)
 
 
@@ -362,97 +355,3 @@ def view(tensor: Tensor, dtype: Any) -> Any:
     if not tensor.numel():  # torch calls any strides of an empty tensor contiguous, Warp does not
         tensor = tensor.new_empty(tensor.shape)
     return wp.from_torch(tensor.detach(), dtype=dtype, requires_grad=False)
-
-
-def scratch(name: str, count: int, dtype: torch.dtype, device: torch.device) -> Tensor:
-    """A flat tensor of at least `count` elements, reused by the next call with this name, thread and CUDA stream.
-
-    Fresh memory costs more than most kernels that write it: the operating system clears every page.
-    """
-    store: dict[tuple[str, torch.dtype, torch.device, int], Tensor] = _local.__dict__.setdefault("store", {})
-    stream = torch.cuda.current_stream(device).cuda_stream if device.type == "cuda" else 0
-    key = (name, dtype, device, stream)
-    held = store.get(key)
-    if held is None or held.numel() < count:
-        with torch.inference_mode(False):  # a tensor made under it could never be written to outside again
-            held = _scratch_memory(max(count + count // 4, 1), dtype, device)
-        store[key] = held
-    return held[:count]
-
-
-HUGE = 2 * 2**20  # bytes of a large page; smaller scratch lies in ordinary ones
-
-
-def _scratch_memory(count: int, dtype: torch.dtype, device: torch.device) -> Tensor:
-    """Uninitialised; on Linux in large pages, if it fills some: kernels jump about in it, and pages are looked up."""
-    size = count * dtype.itemsize
-    if device.type != "cpu" or size < HUGE or not hasattr(mmap, "MADV_HUGEPAGE"):
-        return torch.empty(count, dtype=dtype, device=device)
-    # Not shared, as Python's default is: a forked process would write into this one's memory.
-    memory = mmap.mmap(-1, size + HUGE, flags=mmap.MAP_PRIVATE | mmap.MAP_ANONYMOUS)
-    with suppress(OSError):  # a kernel without them
-        memory.madvise(mmap.MADV_HUGEPAGE)
-    start = -np.frombuffer(memory, np.uint8).ctypes.data % HUGE
-    return torch.frombuffer(memory, dtype=dtype, count=count, offset=start)
-
-
-def counters(count: int, device: torch.device) -> Tensor:
-    """int32 zeros that the blocks of a kernel count in (`comes_last`); they are zero again after each launch.
-
-    As scratch, they belong to a thread and a stream, whose launches follow each other.
-    """
-    store: dict[Any, Tensor] = _local.__dict__.setdefault("counters", {})
-    key = (device, torch.cuda.current_stream(device).cuda_stream if device.type == "cuda" else 0)
-    held = store.get(key)
-    if held is None or len(held) < count:
-        with torch.inference_mode(False):
-            held = store[key] = torch.zeros(max(count, MOST_COUNTERS), dtype=torch.int32, device=device)
-    return held
-
-
-LARGE = 4 * 2**20  # what is larger pays for pages: cleared anew each time, or small ones to look up
-MAX_IDLE = 2  # large images that are kept for the next one of their size
-
-
-class _Lent(np.ndarray):
-    """Memory of a tensor that was given away; unlike a plain array it can be watched for its end."""
-
-
-_idle: deque[np.ndarray] = deque(maxlen=MAX_IDLE)
-
-
-def fresh(*shape: int, device: torch.device) -> Tensor:
-    """An uninitialised float32 tensor for the caller to keep; large ones on the CPU use again what others left.
-
-    Clearing the pages of 64 channels takes about as long as compositing them.
-    """
-    count = math.prod(shape)
-    if device.type != "cpu" or 4 * count <= LARGE:
-        return torch.empty(shape, device=device)
-    owner = _left_over(count)
-    return _lend(_scratch_memory(count, torch.float32, device).numpy() if owner is None else owner, shape)
-
-
-def _left_over(count: int) -> np.ndarray | None:
-    for _ in range(MAX_IDLE):
-        try:
-            owner = _idle.popleft()
-        except IndexError:  # none is left, or another thread took it
-            return None
-        if len(owner) == count:
-            return owner
-        _idle.append(owner)
-    return None
-
-
-def _lend(owner: np.ndarray, shape: tuple[int, ...]) -> Tensor:
-    lent = owner.view(_Lent)
-    weakref.finalize(lent, _idle.append, owner).atexit = False
-    return torch.from_numpy(lent).view(shape)
-
-
-def release_scratch() -> None:
-    """Give the calling thread's scratch memory back, and what large images left."""
-    _local.__dict__.pop("store", None)
-    _local.__dict__.pop("counters", None)
-    _idle.clear()

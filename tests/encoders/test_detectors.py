@@ -301,6 +301,7 @@ def write_closed_set(folder, tools, kind):
 def test_closed_sets(kind, tools, tmp_path, view, image):
     write_closed_set(tmp_path, tools, kind)
     source = ClosedSet(str(tmp_path), least=0.0, longest=64)
+    assert source.needs_image
     found = source.encode(view, image)
     assert (found.space, found.labels) == ("labels", ("couch", "lamp", "wall"))
     assert found.size == (16, 16)  # 48 x 64 becomes 64 x 64, read at a quarter

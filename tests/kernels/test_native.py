@@ -7,7 +7,7 @@ import warp as wp
 
 from sgwarp.kernels.native import power_and_reciprocal
 from sgwarp.kernels.transmittance import LANE_OPTIONS, Lanes
-from sgwarp.ops import launcher
+from sgwarp.ops import memory
 
 
 def evaluate(x: np.ndarray, portable: bool) -> tuple[np.ndarray, np.ndarray]:
@@ -40,11 +40,11 @@ def test_reciprocals_of_what_passes_a_gaussian(portable):
 
 
 def large(channels: int) -> torch.Tensor:
-    return launcher.fresh(512, 512, channels, device=torch.device("cpu"))
+    return memory.fresh(512, 512, channels, device=torch.device("cpu"))
 
 
 def test_large_images_use_again_what_others_left():
-    launcher.release_scratch()
+    memory.release_scratch()
     first = large(64)
     address = first.data_ptr()
     view = first[:10]
@@ -60,9 +60,9 @@ def test_large_images_use_again_what_others_left():
 
 
 def test_no_more_than_two_large_images_wait_for_use():
-    launcher.release_scratch()
+    memory.release_scratch()
     images = [large(64 + i) for i in range(4)]
     del images
-    assert len(launcher._idle) == launcher.MAX_IDLE
-    launcher.release_scratch()
-    assert not launcher._idle
+    assert len(memory._idle) == memory.MAX_IDLE
+    memory.release_scratch()
+    assert not memory._idle

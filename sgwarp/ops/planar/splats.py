@@ -25,6 +25,7 @@ from sgwarp.ops.launcher import launch, view
 from sgwarp.ops.planar.projection import FACTOR_UNIT
 from sgwarp.ops.splatting import backward, tiles
 from sgwarp.ops.splatting.forward import composite, composite_recorded
+from sgwarp.ops.splatting.gradients import ImageGradients
 from sgwarp.ops.splatting.settings import RasterSettings
 from sgwarp.scene import Camera
 
@@ -165,7 +166,7 @@ class _CompositeSplats(torch.autograd.Function):
             _finite_rows(features)[0],
             features.shape[1],
             (kept[0], kept[1], kept[2]),
-            backward.ImageGradients(v_image, v_transmittance, v_depth_sum if job.wants_depth else None),
+            ImageGradients(v_image, v_transmittance, v_depth_sum if job.wants_depth else None),
             len(means2d),
             absolute=job.receive_absolute is not None,
         )

@@ -17,8 +17,8 @@ from sgwarp.kernels.harmonics import forward as harmonics
 from sgwarp.kernels.projection import table as kernels
 from sgwarp.ops.launcher import launch, launch_plain, view
 from sgwarp.ops.splatting import backward, tiles
-from sgwarp.ops.splatting.backward import SplatGradients
 from sgwarp.ops.splatting.forward import LANE
+from sgwarp.ops.splatting.gradients import SplatGradients
 from sgwarp.ops.splatting.settings import RasterSettings
 from sgwarp.scene import Camera, Gaussians
 from sgwarp.scene.checks import require_cameras

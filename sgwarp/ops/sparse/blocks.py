@@ -13,7 +13,8 @@ from torch import Tensor
 
 from sgwarp.kernels.sparse import convolution_block as kernels
 from sgwarp.kernels.sparse import products_block
-from sgwarp.ops.launcher import counters, launch_blocks, scratch, view
+from sgwarp.ops.launcher import launch_blocks, view
+from sgwarp.ops.memory import counters, scratch
 from sgwarp.ops.sparse.voxels import KernelMap
 
 MAX_OFFSETS = kernels.MAX_OFFSETS

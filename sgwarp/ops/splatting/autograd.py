@@ -10,7 +10,7 @@ from torch import Tensor
 
 from sgwarp.errors import InputError
 from sgwarp.ops.planar.harmonics import harmonic_colors
-from sgwarp.ops.splatting import backward, forward, tiles
+from sgwarp.ops.splatting import backward, backward_lanes, forward, tiles
 from sgwarp.ops.splatting.forward import (
     Rendering,
     composite_recorded,
@@ -18,6 +18,7 @@ from sgwarp.ops.splatting.forward import (
     require_finite_features,
     runs_in_blocks,
 )
+from sgwarp.ops.splatting.gradients import ImageGradients
 from sgwarp.ops.splatting.loading import load_rendering
 from sgwarp.ops.splatting.plan import RenderPlan, plan_render
 from sgwarp.ops.splatting.room import ListRoom
@@ -291,13 +292,13 @@ class _Rasterize(torch.autograd.Function):
         means, quats, scales, opacities, values, world_to_camera, *kept = ctx.saved_tensors
         gaussians = _gaussians(means, quats, scales, opacities, values, request)
         recorded, lists = (kept[0], kept[1], kept[2]), tiles.TileLists(*kept[3:])
-        gradients = backward.ImageGradients(v_image, v_transmittance, v_depth_sum, v_surface)
+        gradients = ImageGradients(v_image, v_transmittance, v_depth_sum, v_surface)
         pose, absolute, degree = ctx.needs_input_grad[5], request.receives_absgrad is not None, request.plan.sh_degree
         features = None if request.harmonics else values
         compositing = (lists, camera, settings, features, ctx.channels, recorded, gradients)
         if request.harmonics and len(lists.row_ranges) and v_surface is None and not absolute:
-            replayed = backward.replay(*compositing)
-            result, v_values, v_offsets = backward.differentiate(
+            replayed = backward_lanes.replay(*compositing)
+            result, v_values, v_offsets = backward_lanes.differentiate(
                 gaussians, camera, settings, replayed, degree, pose=pose, centres=ctx.needs_input_grad[6]
             )
         else:

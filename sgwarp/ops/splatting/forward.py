@@ -14,7 +14,8 @@ from sgwarp.kernels.compositing import lanes as compositing_lanes
 from sgwarp.kernels.compositing import lanes_features as compositing_lanes_features
 from sgwarp.kernels.native import BATCH, Seen
 from sgwarp.kernels.transmittance import Lanes
-from sgwarp.ops.launcher import fresh, get_threads, launch, launch_blocks, scratch, view, warp_device
+from sgwarp.ops.launcher import get_threads, launch, launch_blocks, view, warp_device
+from sgwarp.ops.memory import fresh, scratch
 from sgwarp.ops.splatting import tiles
 from sgwarp.ops.splatting.loading import WIDE_PASS, load_rendering, load_wide_rendering
 from sgwarp.ops.splatting.plan import RenderPlan, Values, plan_render

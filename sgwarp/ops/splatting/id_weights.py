@@ -14,7 +14,8 @@ from sgwarp.kernels.lifting import lanes as lifting_lanes
 from sgwarp.kernels.lifting import pairs as lifting_pairs
 from sgwarp.kernels.lifting import shared as lifting
 from sgwarp.kernels.transmittance import LaneIds
-from sgwarp.ops.launcher import launch, launch_blocks, scratch, view
+from sgwarp.ops.launcher import launch, launch_blocks, view
+from sgwarp.ops.memory import scratch
 from sgwarp.ops.splatting import tiles
 from sgwarp.ops.splatting.forward import LANE, TILE_ROWS, lane_scratch
 from sgwarp.ops.splatting.settings import RasterSettings

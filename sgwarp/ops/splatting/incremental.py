@@ -18,7 +18,7 @@ import torch
 from torch import Tensor
 
 from sgwarp.errors import InputError
-from sgwarp.ops.launcher import scratch
+from sgwarp.ops.memory import scratch
 from sgwarp.ops.splatting import tiles
 from sgwarp.ops.splatting.kept_views import (
     KeptView,

@@ -10,7 +10,8 @@ from torch import Tensor
 
 from sgwarp.kernels.lifting import lanes, lanes_changes, shared
 from sgwarp.kernels.transmittance import LaneIds, Lanes
-from sgwarp.ops.launcher import get_threads, launch, scratch, view
+from sgwarp.ops.launcher import get_threads, launch, view
+from sgwarp.ops.memory import scratch
 from sgwarp.ops.splatting import tiles
 from sgwarp.ops.splatting.forward import LANE, TILE_ROWS, in_slices, lane_scratch
 from sgwarp.ops.splatting.id_weights import first_weights, weight_count

@@ -19,7 +19,8 @@ from sgwarp.kernels.lifting import block as lifting_block
 from sgwarp.kernels.lifting import lanes as lifting_lanes
 from sgwarp.kernels.lifting import shared as lifting
 from sgwarp.kernels.transmittance import Lanes
-from sgwarp.ops.launcher import launch, launch_blocks, launch_plain, scratch, view
+from sgwarp.ops.launcher import launch, launch_blocks, launch_plain, view
+from sgwarp.ops.memory import scratch
 from sgwarp.ops.splatting import tiles
 from sgwarp.ops.splatting.forward import LANE, TILE_ROWS, in_slices, lane_scratch
 from sgwarp.ops.splatting.id_weights import localize_ids, weigh_ids

@@ -18,7 +18,8 @@ from sgwarp.kernels.harmonics import forward as harmonics
 from sgwarp.kernels.native import GROUP
 from sgwarp.kernels.projection import forward as projection
 from sgwarp.kernels.projection import lanes as projection_lanes
-from sgwarp.ops.launcher import launch, launch_plain, scratch, sort_pairs, view, warp_device
+from sgwarp.ops.launcher import launch, launch_plain, sort_pairs, view, warp_device
+from sgwarp.ops.memory import scratch
 from sgwarp.ops.splatting.room import MOST, ListRoom
 from sgwarp.ops.splatting.settings import RasterSettings
 from sgwarp.scene import Camera, Gaussians

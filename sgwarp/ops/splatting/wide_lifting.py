@@ -11,7 +11,8 @@ from torch import Tensor
 from sgwarp.kernels.lifting import lanes_wide, shared
 from sgwarp.kernels.lifting.loops import WIDE as WIDE
 from sgwarp.kernels.transmittance import Lanes
-from sgwarp.ops.launcher import get_threads, launch, scratch, view
+from sgwarp.ops.launcher import get_threads, launch, view
+from sgwarp.ops.memory import scratch
 from sgwarp.ops.splatting import tiles
 from sgwarp.ops.splatting.forward import LANE, TILE_ROWS, lane_scratch
 from sgwarp.ops.splatting.lift_sums import LiftSums

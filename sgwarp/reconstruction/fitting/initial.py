@@ -60,16 +60,23 @@ def gaussians_from_points(
         drawn = torch.randperm(len(positions), generator=generator(settings.seed, 0, "points"))[: settings.cap]
         kept = drawn.sort().values
         positions, colours = positions[kept], colours[kept]
-    distance = mean_squared_neighbor_distance(positions).sqrt().clamp(min=LEAST_DISTANCE * extent)
+    return _round_gaussians(positions, colours, size * _spacing(positions, extent), settings).to(device)
+
+
+def _spacing(positions: Tensor, extent: float) -> Tensor:
+    """Root mean square distance of each point to the three nearest others, [N]."""
+    return mean_squared_neighbor_distance(positions).sqrt().clamp(min=LEAST_DISTANCE * extent)
+
+
+def _round_gaussians(positions: Tensor, colours: Tensor, deviations: Tensor, settings: FitSettings) -> Gaussians:
     count = len(positions)
-    gaussians = Gaussians(
+    return Gaussians(
         means=positions.to(torch.float32),
         quats=torch.tensor([1.0, 0.0, 0.0, 0.0]).expand(count, 4),
-        scales=(size * distance)[:, None].expand(count, 3),
+        scales=deviations[:, None].expand(count, 3),
         opacities=torch.full((count,), OPACITY[settings.strategy]),
         sh=((colours - 0.5) / SH_C0)[:, None, :],
     )
-    return gaussians.to(device)
 
 
 def checked_points(positions: Any, colours: Any) -> tuple[Tensor, Tensor]:
@@ -141,10 +148,9 @@ def completed(
         return gaussians_from_points(positions, colors, settings, extent)
     every = torch.cat([positions, more.means.to(positions.dtype)])
     # Sizes by the distances to both: a sparse point is no large ball in front of a surface.
-    distance = mean_squared_neighbor_distance(every).sqrt().clamp(min=LEAST_DISTANCE * extent)[: len(positions)]
-    own = gaussians_from_points(positions, colors, settings, extent)
-    own = replace(own, scales=(SIZE * distance)[:, None].expand(-1, 3).to(torch.float32))
-    return join_gaussians([own, more])
+    spacing = _spacing(every, extent)[: len(positions)]
+    own = torch.as_tensor(colors).to(torch.float32)
+    return join_gaussians([_round_gaussians(positions, own, SIZE * spacing, settings), more])
 
 
 def _surfaces(
