@@ -111,6 +111,26 @@ def test_scenes_are_bent_in_nineteen_of_twenty_cases_by_every_field(gaussians, m
     assert 0.91 < bent / 300 < 0.99
 
 
+def test_bending_stretches_the_gaussians(gaussians, monkeypatch):
+    """A field whose displacement grows by its distance along x doubles what lies along x."""
+    gradient = torch.diag(torch.tensor([1.0, 0.0, 0.0]))
+    calls = []
+
+    def stretch(points, *rest):
+        calls.append(points)
+        return torch.zeros_like(points), gradient.expand(len(points), 3, 3)
+
+    monkeypatch.setattr(augmentation, "bend", stretch)
+    few = gaussians.subset(torch.arange(3))
+    few = replace(few, quats=torch.tensor([[1.0, 0, 0, 0]]).repeat(3, 1), scales=torch.full((3, 3), 0.1))
+    for seed in range(9):  # a scene in twenty is not bent
+        bent = replace(STILL, elastic=((0.2, 0.4),))(few, VOXEL, torch.Generator().manual_seed(seed))
+        if calls:
+            break
+    expected = torch.tensor([0.1, 0.1, 0.2]).expand(3, 3)
+    torch.testing.assert_close(bent.scales.sort(dim=1).values, expected, rtol=1e-4, atol=0)
+
+
 def nodes(count: int = 40) -> torch.Tensor:
     """Places of the lattice's nodes, a little inside of the cells that begin there."""
     line = torch.arange(count, dtype=torch.float64)

@@ -98,6 +98,13 @@ def test_large_photographs_are_scaled_down_with_a_notice(boards, caplog):
     assert "1 photographs are scaled down to 32 pixels (the first is 64 x 48); --max-size" in caplog.text
 
 
+def test_reading_photographs_says_how_far_it_is(boards):
+    said = []
+    read_photographs(boards.views, progress=lambda *call: said.append(call))
+    assert said[0] == (0, 8, "")
+    assert said[1:] == [(done, 8, view.stem) for done, view in enumerate(boards.views, start=1)]
+
+
 def test_photographs_beyond_the_memory_are_read_from_a_file():
     random = np.random.default_rng(0)
     images = [random.integers(0, 256, (5, 7, 3), np.uint8) for _ in range(4)]

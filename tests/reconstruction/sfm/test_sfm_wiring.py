@@ -171,6 +171,13 @@ def test_parts_that_could_not_be_joined_are_named(library, tmp_path, monkeypatch
     assert (said in caplog.text) == warned
 
 
+def test_one_part_that_lacks_photographs_is_no_part_among_others(library, tmp_path, monkeypatch, caplog):
+    models = {0: SimpleNamespace(num_reg_images=lambda: 7)}
+    monkeypatch.setattr(library, "incremental_mapping", lambda *a, **o: models)
+    assert poses._map(tmp_path / "d.db", tmp_path, tmp_path, SETTINGS, 12, lambda *call: None) is models[0]
+    assert not caplog.records
+
+
 def test_photographs_that_cannot_be_placed_are_an_error(library, tmp_path, monkeypatch):
     monkeypatch.setattr(library, "incremental_mapping", lambda *a, **o: {})
     with pytest.raises(InputError, match="no two photographs overlap enough"):
