@@ -29,7 +29,7 @@ from torch.utils._pytree import tree_leaves, tree_map
 
 import sgwarp
 import sgwarp.ops
-from sgwarp.ops import launcher, memory
+from sgwarp.ops import devices, memory
 
 CUDA = torch.device("cuda", 0)
 OUTSIDE = "outside the package"
@@ -468,7 +468,7 @@ def _pretend_warp(patch: pytest.MonkeyPatch, device: PretendedDevice) -> None:
         patch.setattr(holder, "device_from_torch", lambda _: host)
     patch.setattr(wp, "is_cuda_available", lambda: True)
     patch.setattr(wp, "stream_from_torch", PretendedStream)
-    patch.setattr(launcher, "_streams", {})
+    patch.setattr(devices, "_streams", {})
 
     def on_fibers(function: Callable[..., Any]) -> Callable[..., Any]:
         def launch(kernel: Any, *args: Any, stream: Any = None, **kwargs: Any) -> Any:

@@ -19,7 +19,7 @@ import torch
 
 from benchmarks.gpu import checks, page, rivals, timings
 from benchmarks.gpu.bench import Bench
-from sgwarp.ops.launcher import find_device
+from sgwarp.ops.devices import find_device
 
 PARTS = {
     "ceilings": timings.ceilings,

@@ -59,7 +59,8 @@ class Options:
         """
         import torch
 
-        from sgwarp.ops.launcher import MAX_THREADS, find_device, get_threads, set_threads
+        from sgwarp.ops.devices import find_device
+        from sgwarp.ops.launcher import MAX_THREADS, get_threads, set_threads
 
         if self.threads is not None:
             if not 1 <= self.threads <= MAX_THREADS:

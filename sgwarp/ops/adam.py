@@ -12,7 +12,8 @@ from sgwarp.kernels.fitting import adam as kernels
 from sgwarp.kernels.fitting import adam_elements
 from sgwarp.kernels.fitting import adam_lanes as optimizing_lanes
 from sgwarp.kernels.transmittance import Lanes
-from sgwarp.ops.launcher import launch, launch_plain, view
+from sgwarp.ops.arguments import view
+from sgwarp.ops.launcher import launch, launch_plain
 
 LANE = 16
 BETAS = (float(kernels.BETA_1), float(kernels.BETA_2))

@@ -10,7 +10,8 @@ from torch import Tensor
 
 from sgwarp.errors import InputError
 from sgwarp.kernels.points import deformation
-from sgwarp.ops.launcher import launch, view
+from sgwarp.ops.arguments import view
+from sgwarp.ops.launcher import launch
 from sgwarp.scene import Gaussians
 
 

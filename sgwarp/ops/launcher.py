@@ -6,14 +6,14 @@ threads take chunks in turn; every kernel writes disjoint memory, so the result 
 
 from __future__ import annotations
 
+import copy
 import itertools
 import os
-import re
-import sys
 import threading
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager, suppress
+from functools import lru_cache
 from typing import Any
 
 import torch
@@ -21,37 +21,14 @@ import warp as wp
 from torch import Tensor
 
 from sgwarp.errors import InputError
-from sgwarp.ops import kernel_cache
+from sgwarp.ops.arguments import as_array, require_types
+from sgwarp.ops.devices import current_stream
 from sgwarp.ops.kernel_cache import mended
 
 CHUNKS_PER_THREAD = 8  # enough to even out tiles of different cost
+SMALLEST_CHUNK = 8  # so much smaller is the last chunk, which the other threads wait for
 MAX_THREADS = 512
-LEAST_DRIVER = 580  # of NVIDIA, that the wheels of Warp 1.19 take; they are built with CUDA 13
 SMALL = 256  # below this many threads of a launch, a second host thread costs more than it saves
-
-
-def _init_warp() -> None:
-    """Start Warp without its banner, and on a machine without a GPU without the warning that there is none."""
-    if wp.config.log_level == wp.LOG_INFO:
-        wp.config.log_level = wp.LOG_WARNING
-    if torch.cuda.is_available():
-        kernel_cache.start()
-        return
-    # The native library writes that warning straight to file descriptor 2, past every setting.
-    sys.stderr.flush()
-    kept = os.dup(2)
-    sink = os.open(os.devnull, os.O_WRONLY)
-    try:
-        os.dup2(sink, 2)
-        kernel_cache.start()
-    finally:
-        os.dup2(kept, 2)
-        os.close(kept)
-        os.close(sink)
-
-
-_init_warp()
-kernel_cache.tell()
 
 
 def _available_cores() -> int:
@@ -60,7 +37,6 @@ def _available_cores() -> int:
 
 
 _thread_count = _available_cores()
-_streams: dict[tuple[int, int], Any] = {}  # torch's streams as Warp's, by device and handle
 _sorting = threading.Lock()
 _pool: ThreadPoolExecutor | None = None
 _pool_lock = threading.Lock()
@@ -143,6 +119,7 @@ def launch(
     device: torch.device,
     slots: bool = False,
     chunk: int | None = None,
+    order: Sequence[int] | None = None,
 ) -> None:
     """Run a kernel whose first argument is the first index of the launch.
 
@@ -150,7 +127,8 @@ def launch(
         kernel: Takes `base` (and then `slot`, if `slots`) before `inputs`.
         count: Number of kernel threads.
         slots: Pass the number of the host thread, which names its scratch; less than `get_threads()`.
-        chunk: Kernel threads per host launch, by default an eighth of a host thread's share.
+        chunk: Kernel threads per host launch, by default an eighth of a host thread's share, and less at the end.
+        order: In which to take the kernel threads one by one, on the CPU; the longest first, and all end together.
 
     Raises:
         Interrupted: In a block of `interruptible`.
@@ -160,29 +138,33 @@ def launch(
     unwanted: Callable[[], bool] = getattr(_local, "unwanted", None) or _never
     if unwanted():
         raise Interrupted
-    head = [0, 0] if slots else [0]
+    arguments = [*([0, 0] if slots else [0]), *inputs, *outputs]
+    require_types(kernel, arguments)
     if device.type == "cuda":
         stream = current_stream(device)
-        mended(kernel, lambda: wp.launch(kernel, count, [*head, *inputs], outputs, stream=stream))
+        mended(kernel, lambda: wp.launch(kernel, count, arguments, stream=stream))
         return
     threads = 1 if chunk is None and count < SMALL else min(_thread_count, count)
     if threads == 1:
-        mended(kernel, lambda: wp.launch(kernel, count, [*head, *inputs], outputs, device="cpu"))
+        mended(kernel, lambda: wp.launch(kernel, count, arguments, device="cpu"))
         return
-    size = chunk or max(1, -(-count // (threads * CHUNKS_PER_THREAD)))
+    chunks = _chunks(count, threads, chunk) if order is None else tuple((base, 1) for base in order)
     ticket = itertools.count()  # next() is atomic under the interpreter lock
+    recorded = mended(kernel, lambda: wp.launch(kernel, count, arguments, device="cpu", record_cmd=True))
 
     def work(slot: int) -> None:
-        command = None
-        while (base := next(ticket) * size) < count and not unwanted():
-            if command is None:
-                first = [base, slot] if slots else [base]
-                command = wp.launch(kernel, size, [*first, *inputs], outputs, device="cpu", record_cmd=True)
-            command.set_param_at_index(0, base)
-            command.set_dim(min(size, count - base))
+        command, held = _own(recorded, 1 + slots), 0
+        if slots:
+            command.set_param_at_index_from_ctype(1, slot)
+        while (number := next(ticket)) < len(chunks) and not unwanted():
+            # Others wait for the interpreter meanwhile: as few steps as possible.
+            base, size = chunks[number]
+            if size != held:
+                command.set_dim(size)
+                held = size
+            command.set_param_at_index_from_ctype(0, base)
             command.launch()
 
-    mended(kernel, lambda: kernel.module.load("cpu", block_dim=1))  # once, before several threads ask for it
     helpers = [_executor().submit(work, slot) for slot in range(1, threads)]
     try:
         work(0)
@@ -191,6 +173,34 @@ def launch(
             helper.result()
     if unwanted():  # some chunk may have been left out
         raise Interrupted
+
+
+def _own(recorded: Any, numbers: int) -> Any:
+    """The recorded launch with a size and the first `numbers` parameters of its own; all else is shared."""
+    command = copy.copy(recorded)
+    command.params = list(recorded.params)
+    for k in range(1, 1 + numbers):  # behind the bounds, which `set_dim` replaces
+        command.params[k] = type(command.params[k])()
+    command.fwd_args = None
+    return command
+
+
+@lru_cache(maxsize=256)
+def _chunks(count: int, threads: int, chunk: int | None) -> tuple[tuple[int, int], ...]:
+    """First index and length of each host launch, one behind the other.
+
+    Without a `chunk`, of a thread's share each takes an eighth, and towards the end less and less, down to an eighth
+    of that: a thread that comes last leaves the others little to wait for.
+    """
+    largest = chunk or max(1, -(-count // (threads * CHUNKS_PER_THREAD)))
+    smallest = chunk or max(1, largest // SMALLEST_CHUNK)
+    chunks, base = [], 0
+    while base < count:
+        rest = count - base
+        size = min(rest, max(smallest, min(largest, rest // (2 * threads))))
+        chunks.append((base, size))
+        base += size
+    return tuple(chunks)
 
 
 _loaded: set[str] = set()  # modules that `load_together` has seen
@@ -234,15 +244,16 @@ def launch_blocks(
     kernel: wp.Kernel, grid: Sequence[int], inputs: Sequence[Any], outputs: Sequence[Any], *, device: torch.device
 ) -> None:
     """Run a block-schedule kernel with 256 threads per block; on the CPU the threads are cooperative fibers."""
+    arguments = [*inputs, *outputs]
+    require_types(kernel, arguments)
+    tiles: dict[str, Any] = {"dim": list(grid), "inputs": arguments, "block_dim": 256}
     if device.type == "cuda":
         stream = current_stream(device)
-        tiles = {"dim": list(grid), "inputs": inputs, "outputs": outputs, "block_dim": 256}
         mended(kernel, lambda: wp.launch_tiled(kernel, **tiles, stream=stream))
         return
     previous = wp.config.enable_cpu_blocks
     wp.config.enable_cpu_blocks = True
     try:
-        tiles = {"dim": list(grid), "inputs": inputs, "outputs": outputs, "block_dim": 256}
         mended(kernel, lambda: wp.launch_tiled(kernel, **tiles, device="cpu"))
     finally:
         wp.config.enable_cpu_blocks = previous
@@ -259,6 +270,7 @@ def launch_plain(
     """Run a kernel that takes no `base`, in one launch."""
     if count == 0 or (isinstance(count, tuple) and 0 in count):
         return
+    require_types(kernel, [*inputs, *outputs])
     if device.type == "cuda":
         stream = current_stream(device)
         mended(kernel, lambda: wp.launch(kernel, count, inputs, outputs, stream=stream))
@@ -278,7 +290,7 @@ def sort_pairs(keys: Tensor, values: Tensor, count: int, key_type: Any, *, end_b
     """
     if not count:
         return
-    arrays = view(keys, key_type), view(values, wp.int32)
+    arrays = as_array(keys, key_type), as_array(values, wp.int32)
     if not keys.is_cuda:
         wp.utils.radix_sort_pairs(*arrays, count, end_bit=end_bit)
         return
@@ -286,72 +298,3 @@ def sort_pairs(keys: Tensor, values: Tensor, count: int, key_type: Any, *, end_b
     # stream is Warp's for all threads, hence the lock.
     with _sorting, wp.ScopedStream(current_stream(keys.device), sync_enter=False):
         wp.utils.radix_sort_pairs(*arrays, count, end_bit=end_bit)
-
-
-def current_stream(device: torch.device) -> wp.Stream:
-    """torch's current stream of a CUDA device, as Warp's.
-
-    One object is kept for each stream. A temporary one would register and forget the stream in each launch, and take
-    the memory with it that sorting keeps for the stream.
-    """
-    stream = torch.cuda.current_stream(device)
-    key = (stream.device_index, stream.cuda_stream)
-    held = _streams.get(key)
-    if held is None:
-        require_warp(device)
-        held = _streams.setdefault(key, wp.stream_from_torch(stream))
-    return held
-
-
-def warp_device(device: torch.device) -> wp.Device:
-    """The device, as Warp's.
-
-    Raises:
-        InputError: It is one of CUDA, and Warp has none.
-    """
-    require_warp(device)
-    return wp.device_from_torch(device)
-
-
-def require_warp(device: torch.device) -> None:
-    """Refuse a CUDA device that torch has and Warp has not: it wants a newer driver.
-
-    Raises:
-        InputError: Warp has no CUDA device.
-    """
-    if device.type == "cuda" and not wp.is_cuda_available():
-        raise InputError(
-            f"device {device}: Warp {wp.__version__} has no CUDA device here, though torch has one: it needs an NVIDIA "
-            f"driver of version {LEAST_DRIVER} or newer; update the driver, or compute on the CPU"
-        )
-
-
-def find_device(name: str | torch.device) -> torch.device:
-    """The device of this name: "cpu", "cuda" (torch's current one) or "cuda:N".
-
-    Raises:
-        InputError: There is no device of this name, or Warp does not drive it.
-    """
-    match = re.fullmatch(r"cpu|cuda(?::(\d+))?", str(name))
-    if match is None:
-        raise InputError(f"device {name}: expected cpu, cuda or cuda:N")
-    if str(name) == "cpu":
-        return torch.device("cpu")
-    if not torch.cuda.is_available():
-        raise InputError(f"device {name}: this machine or this torch has no CUDA device; use cpu")
-    count = torch.cuda.device_count()
-    index = torch.cuda.current_device() if match[1] is None else int(match[1])
-    if index >= count:
-        raise InputError(f"device {name}: there are {count}, cuda:0 to cuda:{count - 1}")
-    device = torch.device("cuda", index)
-    require_warp(device)
-    return device
-
-
-def view(tensor: Tensor, dtype: Any) -> Any:
-    """The tensor's memory as a Warp array, without a copy; vector types take the last dimension."""
-    if tensor.is_cuda:
-        require_warp(tensor.device)
-    if not tensor.numel():  # torch calls any strides of an empty tensor contiguous, Warp does not
-        tensor = tensor.new_empty(tensor.shape)
-    return wp.from_torch(tensor.detach(), dtype=dtype, requires_grad=False)

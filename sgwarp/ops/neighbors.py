@@ -8,7 +8,8 @@ from torch import Tensor
 
 from sgwarp.errors import InputError
 from sgwarp.kernels.points import neighbors
-from sgwarp.ops.launcher import launch, view
+from sgwarp.ops.arguments import view
+from sgwarp.ops.launcher import launch
 
 FAN = neighbors.FAN  # points in a box, boxes in a larger one
 CURVE_BITS = 20  # per axis of the space-filling curve

@@ -12,7 +12,9 @@ from sgwarp.errors import InputError
 from sgwarp.kernels.fitting import photometric_block
 from sgwarp.kernels.fitting import photometric_lanes as kernels
 from sgwarp.kernels.transmittance import LANES, Lanes
-from sgwarp.ops.launcher import launch, launch_blocks, view, warp_device
+from sgwarp.ops.arguments import view
+from sgwarp.ops.devices import warp_device
+from sgwarp.ops.launcher import launch, launch_blocks
 from sgwarp.ops.memory import scratch
 
 FLOAT_BYTES = 4

@@ -11,7 +11,8 @@ from sgwarp.kernels.harmonics import lanes as harmonics_lanes
 from sgwarp.kernels.native import GROUP
 from sgwarp.kernels.projection import lanes_backward
 from sgwarp.kernels.transmittance import Lanes
-from sgwarp.ops.launcher import launch, view
+from sgwarp.ops.arguments import view
+from sgwarp.ops.launcher import launch
 from sgwarp.ops.reference import rasterizer as reference
 from sgwarp.ops.splatting import tiles
 from sgwarp.ops.splatting.settings import RasterSettings

@@ -9,7 +9,8 @@ from sgwarp.kernels.projection import backward as projection_backward
 from sgwarp.kernels.projection import forward as projection
 from sgwarp.kernels.projection import lanes as projection_lanes
 from sgwarp.kernels.projection import lanes_backward as projection_lanes_backward
-from sgwarp.ops.launcher import launch, view
+from sgwarp.ops.arguments import view
+from sgwarp.ops.launcher import launch
 from sgwarp.ops.splatting import tiles
 from sgwarp.ops.splatting.settings import RasterSettings
 from sgwarp.scene import Camera, Gaussians
@@ -63,7 +64,7 @@ def project(scene: Gaussians, settings: RasterSettings, kernel: wp.Kernel, count
     n = len(scene)
     memory, status = torch.zeros(16 * n, dtype=torch.int32), torch.zeros(n, dtype=torch.uint8)
     depths = torch.zeros(n)
-    outputs = [tiles.as_splats(memory), view(status, wp.uint8), view(depths, wp.float32)]
+    outputs = [tiles.view_splats(memory), view(status, wp.uint8), view(depths, wp.float32)]
     launch(kernel, count, inputs(scene, settings, degree), outputs, device=CPU)
     return memory.view(torch.float32).view(n, 16)[:, : len(FIELDS)], status, depths
 
@@ -137,7 +138,7 @@ def test_colors_on_the_way(case, coefficients, degree):
     groups = -(-n // GROUP)
     _, status, _ = project(scene, settings, projection_lanes.project_groups, groups, -1)
     memory, status_out = torch.zeros(16 * n, dtype=torch.int32), torch.zeros(n, dtype=torch.uint8)
-    outputs = [tiles.as_splats(memory), view(status_out, wp.uint8), view(torch.zeros(n), wp.float32)]
+    outputs = [tiles.view_splats(memory), view(status_out, wp.uint8), view(torch.zeros(n), wp.float32)]
     launch(projection_lanes.project_groups, groups, inputs(scene, settings, degree), outputs, device=CPU)
     usable = torch.isfinite(sh[:, : (degree + 1) ** 2]).flatten(1).all(dim=1)
     seen = status == int(projection.VISIBLE)
@@ -155,7 +156,7 @@ def test_depth_order(n):
     depths = torch.randn(n, generator=g) * 10.0 ** torch.randint(-30, 30, (n,), generator=g)
     depths[: n // 2] = depths[: n // 2].sign() * torch.randint(1, 9, (n // 2,), generator=g)
     status = torch.randint(0, 3, (n,), generator=g).to(torch.uint8)
-    projected = tiles.Projected(tiles.as_splats(torch.zeros(16 * n, dtype=torch.int32)), status, depths)
+    projected = tiles.Projected(tiles.view_splats(torch.zeros(16 * n, dtype=torch.int32)), status, depths)
     order = tiles.depth_order(projected).clone()
     expected = sorted((depth, i) for i, depth in enumerate(depths.tolist()) if status[i] == int(projection.VISIBLE))
     assert order.tolist() == [i for _, i in expected]

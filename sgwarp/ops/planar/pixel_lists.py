@@ -11,7 +11,8 @@ from torch import Tensor
 
 from sgwarp.errors import InputError
 from sgwarp.kernels.contributors import pairs as pixel_lists
-from sgwarp.ops.launcher import launch, view
+from sgwarp.ops.arguments import view
+from sgwarp.ops.launcher import launch
 from sgwarp.ops.splatting.settings import RasterSettings
 from sgwarp.ops.splatting.tiles import knobs
 

@@ -21,7 +21,8 @@ from sgwarp.kernels import binning
 from sgwarp.kernels.binning_lanes import PATCH
 from sgwarp.kernels.gaussian import LEVEL_SLACK
 from sgwarp.kernels.projection.forward import TRANSPARENT
-from sgwarp.ops.launcher import launch, view
+from sgwarp.ops.arguments import view
+from sgwarp.ops.launcher import launch
 from sgwarp.ops.planar.projection import FACTOR_UNIT
 from sgwarp.ops.splatting import backward, tiles
 from sgwarp.ops.splatting.forward import composite, composite_recorded
@@ -241,7 +242,7 @@ def _as_splats(
         rows = memory.view(torch.float32).view(-1, tiles.SPLAT_WORDS)
         rows[:, : values.shape[1]] = torch.where(seen[:, None], values, hidden)
     status = torch.where(seen, 0, int(TRANSPARENT)).to(torch.uint8)
-    return tiles.Projected(tiles.as_splats(memory), status, rows[:, DEPTH_WORD].contiguous())
+    return tiles.Projected(tiles.view_splats(memory), status, rows[:, DEPTH_WORD].contiguous())
 
 
 def _follow(given: ListedSplats, projected: tiles.Projected, values: Tensor, camera: Camera) -> tiles.TileLists:
@@ -255,7 +256,7 @@ def _follow(given: ListedSplats, projected: tiles.Projected, values: Tensor, cam
     order = torch.arange(count, dtype=torch.int32, device=device)
     colors = _padded(values) if values.shape[1] <= 3 else torch.empty(0, 3, device=device)
     memory = tiles.splat_memory(count, device, None)
-    ordered = tiles.as_splats(memory)
+    ordered = tiles.view_splats(memory)
     inputs = [view(order, wp.int32), projected.splats, view(colors, wp.vec3)]
     launch(binning.order_splats, count, inputs, [ordered], device=device)
     listed = given.listed.to(torch.int32).contiguous()

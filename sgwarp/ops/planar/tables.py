@@ -15,7 +15,8 @@ from torch import Tensor
 from sgwarp.errors import InputError
 from sgwarp.kernels.harmonics import forward as harmonics
 from sgwarp.kernels.projection import table as kernels
-from sgwarp.ops.launcher import launch, launch_plain, view
+from sgwarp.ops.arguments import view
+from sgwarp.ops.launcher import launch, launch_plain
 from sgwarp.ops.splatting import backward, tiles
 from sgwarp.ops.splatting.forward import LANE
 from sgwarp.ops.splatting.gradients import SplatGradients

@@ -13,7 +13,8 @@ from torch import Tensor
 
 from sgwarp.kernels.sparse import convolution_block as kernels
 from sgwarp.kernels.sparse import products_block
-from sgwarp.ops.launcher import launch_blocks, view
+from sgwarp.ops.arguments import view
+from sgwarp.ops.launcher import launch_blocks
 from sgwarp.ops.memory import counters, scratch
 from sgwarp.ops.sparse.voxels import KernelMap
 

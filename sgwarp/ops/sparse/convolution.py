@@ -16,7 +16,8 @@ from torch.autograd.function import once_differentiable
 
 from sgwarp.errors import InputError
 from sgwarp.kernels.sparse import convolution_lanes as kernels
-from sgwarp.ops.launcher import launch, view
+from sgwarp.ops.arguments import view
+from sgwarp.ops.launcher import launch
 from sgwarp.ops.memory import scratch
 from sgwarp.ops.sparse import blocks
 from sgwarp.ops.sparse.voxels import KernelMap

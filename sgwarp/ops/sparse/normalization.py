@@ -17,7 +17,8 @@ from torch import Tensor
 from torch.autograd.function import once_differentiable
 
 from sgwarp.kernels.sparse import convolution_block, normalization_block, products_block
-from sgwarp.ops.launcher import launch_blocks, launch_plain, view
+from sgwarp.ops.arguments import view
+from sgwarp.ops.launcher import launch_blocks, launch_plain
 from sgwarp.ops.memory import counters, scratch
 from sgwarp.ops.sparse.blocks import Running, convolve, gradients, parts_of, rows_of, typed, types_of
 from sgwarp.ops.sparse.voxels import KernelMap

@@ -17,7 +17,8 @@ from torch import Tensor
 
 from sgwarp.errors import InputError
 from sgwarp.kernels.sparse import voxels
-from sgwarp.ops.launcher import launch, launch_plain, view
+from sgwarp.ops.arguments import view
+from sgwarp.ops.launcher import launch, launch_plain
 
 AXIS_BITS, BIAS = int(voxels.AXIS_BITS), int(voxels.BIAS)
 LIMIT = int(voxels.LIMIT)  # coordinates lie in -LIMIT + 1 to LIMIT - 1

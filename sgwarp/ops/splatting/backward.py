@@ -15,7 +15,8 @@ from sgwarp.kernels.native import GROUP
 from sgwarp.kernels.projection import backward as kernels
 from sgwarp.kernels.projection import lanes_backward as projection_lanes_backward
 from sgwarp.kernels.transmittance import Lanes
-from sgwarp.ops.launcher import launch, launch_blocks, view
+from sgwarp.ops.arguments import view
+from sgwarp.ops.launcher import launch, launch_blocks
 from sgwarp.ops.memory import fresh, scratch
 from sgwarp.ops.splatting import tiles
 from sgwarp.ops.splatting.backward_lanes import ReplayedRows, replay

@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from typing import Any
 
+import numpy as np
 import torch
 import warp as wp
 from torch import Tensor
@@ -17,7 +19,8 @@ from sgwarp.kernels.native import GROUP
 from sgwarp.kernels.projection import backward as kernels
 from sgwarp.kernels.projection import lanes_backward as projection_lanes_backward
 from sgwarp.kernels.transmittance import Lanes
-from sgwarp.ops.launcher import get_threads, launch, view
+from sgwarp.ops.arguments import view
+from sgwarp.ops.launcher import get_threads, launch
 from sgwarp.ops.memory import fresh, scratch
 from sgwarp.ops.splatting import tiles
 from sgwarp.ops.splatting.forward import LANE, TILE_ROWS, in_slices, lane_scratch
@@ -26,7 +29,7 @@ from sgwarp.ops.splatting.settings import RasterSettings
 from sgwarp.scene import Camera, Gaussians
 
 TOGETHER = 4  # slices of 16 channels up to which the features' gradient comes with the geometry's
-CHUNKS = 32  # of patches for a thread: few patches hold many splats, and the last to come is waited for
+CHUNKS = 32  # of patches for a thread: few patches hold many splats; where there are few, each is one
 
 
 @dataclass(frozen=True, eq=False)
@@ -47,7 +50,7 @@ class ReplayedRows:
     features: Tensor
     at_depth: int
 
-    def arrays(self) -> list[wp.array]:
+    def arrays(self) -> list[Any]:
         """Inputs of the kernels that read a Gaussian's rows: ranges, used."""
         return [view(self.lists.row_ranges, wp.int32), view(self.used, wp.uint8)]
 
@@ -87,9 +90,11 @@ def replay(
     inputs += [tiles.knobs(settings), camera.width, camera.height, gradient]
     kernel = compositing_lanes_backward.make_composite_backward(wide, depth, absolute)
     outputs = [view(rows, Lanes), view(used, wp.uint8), view(feature_rows, Lanes)]
-    patches = _patch_count(camera)
+    patches, order = _patch_count(camera), None
     chunk = max(1, patches // (CHUNKS * get_threads()))
-    launch(kernel, patches, inputs, outputs, device=device, slots=True, chunk=chunk)
+    if chunk == 1 and get_threads() > 1:
+        order = _longest_first(lists, camera)
+    launch(kernel, patches, inputs, outputs, device=device, slots=True, chunk=chunk, order=order)
     at_depth, *_ = row_columns(wide, depth, absolute)
     return ReplayedRows(lists, rows, used, feature_rows, at_depth if depth else -1)
 
@@ -97,6 +102,16 @@ def replay(
 def _patch_count(camera: Camera) -> int:
     side = tiles.TILE * PATCH
     return -(-camera.width // side) * -(-camera.height // side)
+
+
+def _longest_first(lists: tiles.TileLists, camera: Camera) -> list[int]:
+    """The patches, those with the most intersections first."""
+    columns, down = -(-camera.width // tiles.TILE), -(-camera.height // tiles.TILE)
+    lengths = np.zeros((-(-down // PATCH), PATCH, -(-columns // PATCH), PATCH), np.int64)
+    whole = lengths.reshape(lengths.shape[0] * PATCH, -1)
+    whole[:down, :columns] = np.diff(lists.offsets.numpy()).reshape(down, columns)
+    order: list[int] = lengths.sum(axis=(1, 3)).ravel().argsort(kind="stable")[::-1].tolist()
+    return order
 
 
 def differentiate(

@@ -12,7 +12,8 @@ from sgwarp.errors import InputError
 from sgwarp.kernels.contributors import block as contributors_block
 from sgwarp.kernels.contributors import lanes as contributors_lanes
 from sgwarp.kernels.transmittance import LaneIds
-from sgwarp.ops.launcher import get_threads, launch, launch_blocks, view
+from sgwarp.ops.arguments import view
+from sgwarp.ops.launcher import get_threads, launch, launch_blocks
 from sgwarp.ops.memory import scratch
 from sgwarp.ops.splatting import tiles
 from sgwarp.ops.splatting.forward import LANE, TILE_ROWS, batch_scratch, lane_scratch, runs_in_blocks

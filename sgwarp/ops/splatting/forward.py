@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Any
 
 import torch
 import warp as wp
@@ -14,7 +15,8 @@ from sgwarp.kernels.compositing import lanes as compositing_lanes
 from sgwarp.kernels.compositing import lanes_features as compositing_lanes_features
 from sgwarp.kernels.native import BATCH, Seen
 from sgwarp.kernels.transmittance import Lanes
-from sgwarp.ops.launcher import get_threads, launch, launch_blocks, view, warp_device
+from sgwarp.ops.arguments import view, view_structs
+from sgwarp.ops.launcher import get_threads, launch, launch_blocks
 from sgwarp.ops.memory import fresh, scratch
 from sgwarp.ops.splatting import tiles
 from sgwarp.ops.splatting.loading import WIDE_PASS, load_rendering, load_wide_rendering
@@ -233,22 +235,20 @@ def _composite(
 TILE_ROWS = 16
 
 
-def lane_scratch(name: str, rows: int, planes: int, device: torch.device) -> wp.array:
+def lane_scratch(name: str, rows: int, planes: int, device: torch.device) -> Any:
     """Scratch vectors [threads, rows, planes] of the lane schedule."""
     shape = (get_threads(), rows, planes, LANE)
     memory = scratch(f"lanes {name}", get_threads() * rows * planes * LANE, torch.float32, device)
     return view(memory.view(shape), Lanes)
 
 
-def batch_scratch(device: torch.device) -> list[wp.array]:
+def batch_scratch(device: torch.device) -> list[Any]:
     """Scratch of the lane schedule for a batch of fragments and the rows they reach."""
     threads, batch = get_threads(), int(BATCH)
     size = wp.types.type_size_in_bytes(Seen)
     memory = scratch("lanes batch", threads * batch * size // 4, torch.int32, device)
-    layout = {"dtype": Seen, "shape": (threads, batch), "capacity": 4 * len(memory)}
-    seen: wp.array = wp.array(ptr=memory.data_ptr(), device=warp_device(device), **layout)
     reached = scratch("lanes reached", threads * TILE_ROWS, torch.int32, device).view(threads, TILE_ROWS)
-    return [seen, view(reached, wp.int32)]
+    return [view_structs(memory, Seen, threads, batch), view(reached, wp.int32)]
 
 
 def in_slices(features: Tensor) -> Tensor:

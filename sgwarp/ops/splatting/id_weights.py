@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Any
 
 import torch
 import warp as wp
@@ -14,7 +15,8 @@ from sgwarp.kernels.lifting import lanes as lifting_lanes
 from sgwarp.kernels.lifting import pairs as lifting_pairs
 from sgwarp.kernels.lifting import shared as lifting
 from sgwarp.kernels.transmittance import LaneIds
-from sgwarp.ops.launcher import launch, launch_blocks, view
+from sgwarp.ops.arguments import view
+from sgwarp.ops.launcher import launch, launch_blocks
 from sgwarp.ops.memory import scratch
 from sgwarp.ops.splatting import tiles
 from sgwarp.ops.splatting.forward import LANE, TILE_ROWS, lane_scratch
@@ -42,11 +44,11 @@ class LocalIds:
     uniform: Tensor
     row_starts: Tensor
 
-    def block_arrays(self) -> list[wp.array]:
+    def block_arrays(self) -> list[Any]:
         """What the block schedule reads."""
         return [view(t, wp.int32) for t in (self.places, self.uniform, self.tile_ids, self.counts, self._starts())]
 
-    def lane_arrays(self) -> list[wp.array]:
+    def lane_arrays(self) -> list[Any]:
         """What the lane schedule reads."""
         return [view(self.places, LaneIds), view(self.uniform, wp.int32), view(self._starts(), wp.int32)]
 
@@ -90,7 +92,7 @@ def weight_count(starts: Tensor) -> int:
     return total
 
 
-def _every_tile(device: torch.device) -> wp.array:
+def _every_tile(device: torch.device) -> Any:
     """No choice of tiles: the kernels take all of them."""
     return view(torch.empty(0, dtype=torch.int32, device=device), wp.int32)
 
@@ -103,7 +105,7 @@ def weigh_ids(
     *,
     block: bool,
     squared: bool = False,
-) -> list[wp.array]:
+) -> list[Any]:
     """Sum of alpha T, or of its square, of every splat for every id of its tile, in a fixed order.
 
     Returns what kernels read that gather them by Gaussian: entries, places, starts, tiles, ids of the tiles, their

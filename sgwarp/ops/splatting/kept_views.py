@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field
+from typing import Any
 
 import torch
 import warp as wp
@@ -10,7 +11,8 @@ from torch import Tensor
 
 from sgwarp.kernels.lifting import lanes, lanes_changes, shared
 from sgwarp.kernels.transmittance import LaneIds, Lanes
-from sgwarp.ops.launcher import get_threads, launch, view
+from sgwarp.ops.arguments import view
+from sgwarp.ops.launcher import get_threads, launch
 from sgwarp.ops.memory import scratch
 from sgwarp.ops.splatting import tiles
 from sgwarp.ops.splatting.forward import LANE, TILE_ROWS, in_slices, lane_scratch
@@ -59,7 +61,7 @@ def same_camera(one: Camera, other: Camera) -> bool:
     return numbers and torch.equal(one.K, other.K) and torch.equal(one.world_to_camera, other.world_to_camera)
 
 
-def _lists(kept: KeptView) -> list[wp.array]:
+def _lists(kept: KeptView) -> list[Any]:
     return [view(kept.offsets, wp.int32), view(kept.listed, wp.int32)]
 
 
@@ -108,7 +110,7 @@ def replace_changed(
     offsets = torch.zeros(count + 1, dtype=torch.int32)
     torch.cumsum(counts, 0, dtype=torch.int32, out=offsets[1:])
     listed = torch.empty(int(offsets[-1]), dtype=torch.int32)
-    inputs = [*common, view(stale, wp.uint8), added_offsets, view(added, wp.int32), tiles.as_splats(kept.splats)]
+    inputs = [*common, view(stale, wp.uint8), added_offsets, view(added, wp.int32), tiles.view_splats(kept.splats)]
     inputs.append(view(offsets, wp.int32))
     launch(lanes_changes.merge_lists, count, inputs, [view(listed, wp.int32)], device=device)
     kept.offsets, kept.listed = offsets, listed
@@ -134,11 +136,11 @@ def lift_again(
     outputs = [view(weights, wp.float32), view(affected, wp.uint8)]
     launch(lanes_changes.carry_weights, kept.tile_count, inputs, outputs, device=stale.device)
     level.row_starts, level.weights = row_starts, weights
-    arrays = [*_lists(kept), tiles.as_splats(kept.splats)]
+    arrays = [*_lists(kept), tiles.view_splats(kept.splats)]
     _walk(arrays, level, labels, chosen, kept.camera, len(kept.listed), settings)
 
 
-def _localize(level: KeptIds, chosen: Tensor, camera: Camera) -> list[wp.array]:
+def _localize(level: KeptIds, chosen: Tensor, camera: Camera) -> list[Any]:
     """List the ids of the chosen tiles, all if there are none; returns where the pixels point into those lists."""
     count, device = len(level.counts), level.ids.device
     local_ids = scratch("local ids", count * 256, torch.int32, device).view(count, TILE_ROWS, LANE)
@@ -151,9 +153,9 @@ def _localize(level: KeptIds, chosen: Tensor, camera: Camera) -> list[wp.array]:
 
 
 def _walk(
-    arrays: list[wp.array],
+    arrays: list[Any],
     level: KeptIds,
-    labels: list[wp.array],
+    labels: list[Any],
     chosen: Tensor,
     camera: Camera,
     intersections: int,

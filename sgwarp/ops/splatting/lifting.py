@@ -8,6 +8,7 @@ A^T 1. Squared: the same with the squares of its entries. Strongest: with the la
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Any
 
 import torch
 import warp as wp
@@ -19,7 +20,8 @@ from sgwarp.kernels.lifting import block as lifting_block
 from sgwarp.kernels.lifting import lanes as lifting_lanes
 from sgwarp.kernels.lifting import shared as lifting
 from sgwarp.kernels.transmittance import Lanes
-from sgwarp.ops.launcher import launch, launch_blocks, launch_plain, view
+from sgwarp.ops.arguments import view
+from sgwarp.ops.launcher import launch, launch_blocks, launch_plain
 from sgwarp.ops.memory import scratch
 from sgwarp.ops.splatting import tiles
 from sgwarp.ops.splatting.forward import LANE, TILE_ROWS, in_slices, lane_scratch
@@ -183,7 +185,7 @@ def _add_wide(
     return first
 
 
-def _valid_lanes(valid: Tensor) -> wp.array:
+def _valid_lanes(valid: Tensor) -> Any:
     """A mask [H, W] as the lane schedule reads it: [H, tile columns, 1] vectors, zero beyond the image."""
     height, width = valid.shape
     columns = -(-width // LANE)

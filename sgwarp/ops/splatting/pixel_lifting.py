@@ -7,7 +7,8 @@ import warp as wp
 from torch import Tensor
 
 from sgwarp.kernels.lifting import shared as lifting
-from sgwarp.ops.launcher import launch, view
+from sgwarp.ops.arguments import view
+from sgwarp.ops.launcher import launch
 from sgwarp.ops.memory import scratch
 from sgwarp.ops.splatting import tiles
 from sgwarp.ops.splatting.contributors import top_contributors

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 from functools import lru_cache
+from typing import Any
 from weakref import WeakKeyDictionary
 
 import torch
@@ -18,7 +19,9 @@ from sgwarp.kernels.harmonics import forward as harmonics
 from sgwarp.kernels.native import GROUP
 from sgwarp.kernels.projection import forward as projection
 from sgwarp.kernels.projection import lanes as projection_lanes
-from sgwarp.ops.launcher import launch, launch_plain, sort_pairs, view, warp_device
+from sgwarp.ops.arguments import view, view_structs
+from sgwarp.ops.devices import warp_device
+from sgwarp.ops.launcher import launch, launch_plain, sort_pairs
 from sgwarp.ops.memory import scratch
 from sgwarp.ops.splatting.room import MOST, ListRoom
 from sgwarp.ops.splatting.settings import RasterSettings
@@ -33,7 +36,7 @@ MAX_INTERSECTIONS = 2**31 - 1
 class Projected:
     """Splats of one view; the arrays are scratch, valid until the next view."""
 
-    splats: wp.array  # Splat [N]
+    splats: Any  # Splat [N], as kernels take it
     status: Tensor  # uint8 [N], see kernels/projection.py
     depths: Tensor  # float32 [N] z [m], valid where visible
 
@@ -82,11 +85,11 @@ class TileLists:
         """The splats in depth order, Splat [V]; a view of `memory`."""
         return as_splats(self.memory)
 
-    def arrays(self) -> list[wp.array]:
+    def arrays(self) -> list[Any]:
         """Inputs of compositing and lifting kernels: offsets, listed, splats."""
-        return [view(self.offsets, wp.int32), view(self.listed, wp.int32), self.splats]
+        return [view(self.offsets, wp.int32), view(self.listed, wp.int32), view_splats(self.memory)]
 
-    def sums(self) -> list[wp.array]:
+    def sums(self) -> list[Any]:
         """Inputs of the kernels that sum the rows of each Gaussian: order, entries, places."""
         return [view(t, wp.int32) for t in (self.order, self.entries, self.places)]
 
@@ -101,8 +104,13 @@ def splat_memory(count: int, device: torch.device, name: str | None) -> Tensor:
     return scratch(name, count * SPLAT_WORDS, torch.int32, device)
 
 
+def view_splats(memory: Tensor) -> Any:
+    """The memory as an array of splats, for kernels."""
+    return view_structs(memory, Splat, len(memory) // SPLAT_WORDS)
+
+
 def as_splats(memory: Tensor) -> wp.array:
-    """The memory as an array of splats; it must outlive the array."""
+    """The memory as an array of splats, to look at; it must outlive the array."""
     count = len(memory) // SPLAT_WORDS
     layout = {"dtype": Splat, "shape": (count,), "capacity": 4 * len(memory)}
     splats: wp.array = wp.array(ptr=memory.data_ptr(), device=warp_device(memory.device), **layout)
@@ -121,11 +129,11 @@ def pinhole(camera: Camera) -> Pinhole:
 
 
 def _make_pinhole(camera: Camera) -> Pinhole:
-    fx, fy, cx, cy = (camera.K[i, j].item() for i, j in ((0, 0), (1, 1), (0, 2), (1, 2)))
+    (fx, _, cx), (_, fy, cy), _ = camera.K.tolist()
     center = camera.position
     rounded = center.to(torch.float32)
     device = Pinhole()
-    device.rotation = wp.mat33(*camera.world_to_camera[:3, :3].flatten().tolist())
+    device.rotation = wp.mat33(*(entry for row in camera.world_to_camera.tolist()[:3] for entry in row[:3]))
     device.center = wp.vec3(*rounded.tolist())
     device.center_rest = wp.vec3(*(center - rounded.to(torch.float64)).tolist())
     device.focal = wp.vec2(fx, fy)
@@ -170,7 +178,7 @@ def project(
             at that are evaluated: of what is hidden and not finite the status says why it is hidden.
     """
     n, device = len(gaussians), gaussians.device
-    splats = as_splats(splat_memory(n, device, "splats"))
+    splats = view_splats(splat_memory(n, device, "splats"))
     status = scratch("status", n, torch.uint8, device)
     depths = scratch("depths", n, torch.float32, device)
     inputs = [
@@ -269,7 +277,7 @@ def bin_splats(
     needs it. On CUDA nobody waits for the length of the lists if they are given a `room`.
     """
     device = order.device
-    packed = view(colors, wp.vec3) if colors is not None else wp.empty(0, dtype=wp.vec3, device=warp_device(device))
+    packed = view(torch.empty(0, 3, device=device) if colors is None else colors, wp.vec3)
     memory = splat_memory(len(order), device, None if keep else "ordered splats")
     order = order.clone() if keep else order
     if device.type == "cuda":
@@ -283,7 +291,7 @@ def bin_splats(
 def bin_by_counting(
     projected: Projected,
     order: Tensor,
-    colors: wp.array,
+    colors: Any,
     camera: Camera,
     memory: Tensor,
     *,
@@ -298,7 +306,7 @@ def bin_by_counting(
     cursors = scratch("tile counts", SLICES * grid, torch.int32, device).view(SLICES, grid).zero_()
     totals = torch.zeros(SLICES + 1, 2, dtype=torch.int64, device=device)
     sizes = [per_slice, camera.width, camera.height]
-    splats = as_splats(memory)
+    splats = view_splats(memory)
     inputs = [view(order, wp.int32), projected.splats, colors, *sizes]
     shared = [view(cursors, wp.int32), view(totals, wp.int64)]
     words = binning_lanes.SPAN_WORDS * count
@@ -331,7 +339,7 @@ def bin_by_counting(
 def bin_by_sorting(
     projected: Projected,
     order: Tensor,
-    colors: wp.array,
+    colors: Any,
     camera: Camera,
     memory: Tensor,
     *,
@@ -345,7 +353,7 @@ def bin_by_sorting(
     device, count, grid = order.device, len(order), _tile_count(camera)
     size = [camera.width, camera.height]
     splat_counts = scratch("splat counts", count, torch.int32, device)
-    splats = as_splats(memory)
+    splats = view_splats(memory)
     inputs = [view(order, wp.int32), projected.splats, colors, view(projected.status, wp.uint8), *size]
     launch_plain(binning.count_splat_tiles, count, inputs, [splats, view(splat_counts, wp.int32)], device=device)
     if room is None:

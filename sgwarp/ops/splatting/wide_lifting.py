@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Any
 
 import torch
 import warp as wp
@@ -11,7 +12,8 @@ from torch import Tensor
 from sgwarp.kernels.lifting import lanes_wide, shared
 from sgwarp.kernels.lifting.loops import WIDE as WIDE
 from sgwarp.kernels.transmittance import Lanes
-from sgwarp.ops.launcher import get_threads, launch, view
+from sgwarp.ops.arguments import view
+from sgwarp.ops.launcher import get_threads, launch
 from sgwarp.ops.memory import scratch
 from sgwarp.ops.splatting import tiles
 from sgwarp.ops.splatting.forward import LANE, TILE_ROWS, lane_scratch
@@ -42,7 +44,7 @@ class Entries:
 
 
 def list_entries(
-    lists: tiles.TileLists, valid: wp.array, settings: RasterSettings, size: tuple[int, int], squared: bool
+    lists: tiles.TileLists, valid: Any, settings: RasterSettings, size: tuple[int, int], squared: bool
 ) -> Entries | None:
     """Entries of A, or None if they take too much memory. `valid` is as `lanes_wide.py` reads it, `size` (H, W)."""
     device, total = lists.order.device, lists.intersections

@@ -8,7 +8,7 @@ import warp as wp
 
 import sgwarp as sg
 from sgwarp.errors import InputError
-from sgwarp.ops import launcher
+from sgwarp.ops import arguments, launcher
 from sgwarp.ops.reference import rasterizer as reference
 from sgwarp.ops.splatting import tiles
 from sgwarp.ops.splatting.forward import composite, rasterize
@@ -123,7 +123,7 @@ def assert_lists_equal(gaussians: Gaussians, camera: Camera) -> None:
     projected, order, colors, counted = lists_of(gaussians, camera)
     kept = [t.clone() for t in vars(counted).values()]
     memory = torch.zeros_like(counted.memory)
-    packed = launcher.view(colors, wp.vec3)
+    packed = arguments.view(colors, wp.vec3)
     by_sort = tiles.bin_by_sorting(projected, order, packed, camera, memory, keep=True)
     for name, want, got in zip(vars(counted), kept, vars(by_sort).values(), strict=True):
         assert torch.equal(want, got), name
@@ -333,7 +333,7 @@ def test_inputs_are_checked(make_scene):
 
 def test_kernels_read_torch_memory_without_a_copy(make_scene):
     _, gaussians, _ = make_scene("random_cloud")
-    assert launcher.view(gaussians.means, wp.vec3).ptr == gaussians.means.data_ptr()
+    assert arguments.view(gaussians.means, wp.vec3).data == gaussians.means.data_ptr()
 
 
 def test_colours_that_are_not_finite_are_marked_as_on_cuda(make_scene):

@@ -1,0 +1,61 @@
+"""Tensors as arguments of kernels: descriptors of their memory. A Warp array would take three times as long to make."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from typing import Any
+
+import torch
+import warp as wp
+from torch import Tensor
+
+from sgwarp.ops.devices import require_warp, warp_device
+
+Descriptor: Any = type(wp.from_torch(torch.empty(1), return_ctype=True))  # address, shape, strides
+
+
+def view(tensor: Tensor, dtype: Any) -> Any:
+    """The tensor's memory for a kernel, without a copy; vector types take the last dimension."""
+    if tensor.is_cuda:
+        require_warp(tensor.device)
+    if not tensor.numel():  # torch calls any strides of an empty tensor contiguous, Warp does not
+        tensor = tensor.new_empty(tensor.shape)
+    described = wp.from_torch(tensor, dtype=dtype, requires_grad=False, return_ctype=True)
+    described.dtype = dtype
+    return described
+
+
+def view_structs(memory: Tensor, dtype: Any, *shape: int) -> Any:
+    """Flat memory as an array of structs, row by row."""
+    if memory.is_cuda:
+        require_warp(memory.device)
+    size = wp.types.type_size_in_bytes(dtype)
+    strides = [size * math.prod(shape[k + 1 :]) for k in range(len(shape))]
+    described = Descriptor(memory.data_ptr(), 0, len(shape), shape, strides)
+    described._ref, described.dtype = memory, dtype  # the memory lives as long as the descriptor
+    return described
+
+
+def as_array(tensor: Tensor, dtype: Any) -> Any:
+    """The tensor's memory as a Warp array, without a copy, for what is not a launch."""
+    warp_device(tensor.device)
+    return wp.from_torch(tensor.detach(), dtype=dtype, requires_grad=False)
+
+
+def require_types(kernel: wp.Kernel, arguments: Sequence[Any]) -> None:
+    """Refuse descriptors of another type or dimension than the kernel's parameters; Warp takes them as they are.
+
+    Raises:
+        TypeError: Some argument does not fit.
+    """
+    for parameter, value in zip(kernel.adj.args, arguments, strict=False):
+        if type(value) is Descriptor:
+            expected: Any = parameter.type
+            same = value.dtype is expected.dtype or wp.types.types_equal(value.dtype, expected.dtype)
+            if not same or value.ndim != expected.ndim:
+                got = f"{value.dtype.__name__} in {value.ndim} dimensions"
+                raise TypeError(
+                    f"kernel {kernel.key}, {parameter.label}: expected {expected.dtype.__name__} in "
+                    f"{expected.ndim} dimensions, got {got}"
+                )
