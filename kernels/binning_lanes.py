@@ -80,6 +80,10 @@ COUNT = (
     typedef float Line __attribute__((ext_vector_type(16), aligned(4)));  // a splat
     typedef unsigned short Kept __attribute__((ext_vector_type(SPANS), aligned(8)));
     int* const counts = tile_counts.data + slice * tile_counts.shape[1];
+    __builtin_memset(counts, 0, tile_counts.shape[1] * sizeof(int));
+    const int slices = tile_counts.shape[0], each = (ranges.shape[0] + slices - 1) / slices;
+    const int cleared = least(each * slice, ranges.shape[0]), until = least(cleared + each, ranges.shape[0]);
+    __builtin_memset(ranges.data + 2 * cleared, 0, (until - cleared) * 2 * sizeof(int));
     long long entries = 0, rows_of_sums = 0;
     for (int k = slice * per_slice; k < end; ++k) {
         const int ahead = k + AHEAD < total ? k + AHEAD : total - 1;
@@ -199,6 +203,7 @@ def count_slice(
     spans: wp.array[wp.uint64],
     rows_of: wp.array[int],
     patches_of: wp.array[int],
+    ranges: wp.array2d[int],
 ): ...
 
 
@@ -240,11 +245,12 @@ def count_tiles(
     height: int,
     # Out:
     ordered_out: wp.array[Splat],  # [V] in depth order, where all later passes read them
-    tile_counts_out: wp.array2d[int],  # [slices, tiles] zeroed
+    tile_counts_out: wp.array2d[int],  # [slices, tiles]
     totals_out: wp.array2d[wp.int64],  # [slices + 1, 2] intersections of each slice, and rows of sums; zeroed
     spans_out: wp.array[wp.uint64],  # [2 V] columns of its first tile rows
     rows_out: wp.array[int],  # [V] its first tile row, and the last above 16 bits
     patches_out: wp.array[int],  # [V] its first column of patches, and their number above 16 bits
+    ranges_out: wp.array2d[int],  # [N + 1, 2] cleared; or empty
 ):
     """Bring the splats into depth order and count intersections per (slice, tile). One thread per slice."""
     count_slice(
@@ -261,6 +267,7 @@ def count_tiles(
         spans_out,
         rows_out,
         patches_out,
+        ranges_out,
     )
 
 
@@ -299,7 +306,7 @@ def fill_tiles(
     places_out: wp.array[int],  # [I] place of each entry; or empty
     tiles_out: wp.array[int],  # [I] tile of each entry; or empty
     row_places_out: wp.array2d[int],  # [V, 2] a, b: the row of sums in patch (r, c) is a + b r + c; or empty, as below
-    ranges_out: wp.array2d[int],  # [N + 1, 2] first row of sums of each Gaussian and their number; zeroed; last: all
+    ranges_out: wp.array2d[int],  # [N + 1, 2] first row of sums of each Gaussian and their number; last: all
 ):
     """Write the tile lists. One thread per slice; the cursors keep slices apart."""
     fill_slice(

@@ -3,7 +3,7 @@
 import warp as wp
 
 from sgwarp.kernels.gaussian import EXACT_OPTIONS
-from sgwarp.kernels.projection.forward import VISIBLE
+from sgwarp.kernels.projection.forward import STATUS_NAMES, VISIBLE
 
 wp.set_module_options(EXACT_OPTIONS)
 
@@ -13,14 +13,16 @@ SORT = f"""
     const int n = status.shape[0];
     Pair* from = reinterpret_cast<Pair*>(pairs.data);
     Pair* to = from + n;
-    int total = 0;
+    int total = 0, seen[4][{len(STATUS_NAMES)}] = {{}};
     for (int i = 0; i < n; ++i) {{
         const unsigned bits = reinterpret_cast<const unsigned*>(depths.data)[i];
         const unsigned key = bits ^ (bits >> 31 ? 0xffffffffu : 0x80000000u);
         from[total] = (Pair)key << 32 | (unsigned)i;
         total += status.data[i] == {int(VISIBLE)};
+        ++seen[i & 3][status.data[i]];  // one table would wait for itself
     }}
-    count.data[0] = total;
+    for (int k = 0; k < {len(STATUS_NAMES)}; ++k)
+        counts_out.data[k] = seen[0][k] + seen[1][k] + seen[2][k] + seen[3][k];
     int counts[DIGITS][BINS] = {{}};
     for (int k = 0; k < total; ++k)
         for (int digit = 0; digit < DIGITS; ++digit) ++counts[digit][from[k] >> (32 + BITS * digit) & (BINS - 1)];
@@ -48,7 +50,7 @@ def sort_visible(
     depths: wp.array[float],
     pairs: wp.array[wp.uint64],
     order: wp.array[int],
-    count: wp.array[int],
+    counts_out: wp.array[wp.int64],
 ): ...
 
 
@@ -61,7 +63,7 @@ def sort_depths(
     pairs: wp.array[wp.uint64],  # [2 N] scratch
     # Out:
     order_out: wp.array[int],  # [N] visible Gaussians by (depth, index); what follows them is not written
-    count_out: wp.array[int],  # [1] how many there are
+    counts_out: wp.array[wp.int64],  # [statuses] how many Gaussians have each
 ):
     """Sort the visible Gaussians."""
-    sort_visible(status, depths, pairs, order_out, count_out)
+    sort_visible(status, depths, pairs, order_out, counts_out)

@@ -56,7 +56,7 @@ def make_composite_backward_block(wide: bool, depth: bool, absolute: bool, order
         splats: wp.array[Splat],  # [V]
         features: wp.array2d[wp.vec4],  # [N, 4 S] channels by four (wide)
         transmittance: wp.array2d[float],  # [H, W]
-        v_transmittance: wp.array2d[float],  # [H, W] its gradient
+        v_alpha: wp.array2d[float],  # [H, W] gradient of 1 - transmittance
         v_colors: wp.array3d[float],  # [H, W, C] gradient of the image
         v_features: wp.array3d[wp.vec4],  # [H, W, 4 S] the same by four channels (wide)
         v_depth: wp.array2d[float],  # [H, W] gradient of the depth sum (depth)
@@ -82,7 +82,7 @@ def make_composite_backward_block(wide: bool, depth: bool, absolute: bool, order
         v_z = float(0.0)
         if inside:
             T = transmittance[y, x]
-            behind = v_transmittance[y, x]
+            behind = -v_alpha[y, x]
             latest = last[y, x]
             if wp.static(not wide):
                 for c in range(3):

@@ -64,7 +64,7 @@ def make_composite_backward(wide: bool, depth: bool, absolute: bool) -> wp.Kerne
         splats: wp.array[Splat],  # [V]
         features: wp.array3d[Lanes],  # [N, S, 1] channels in slices of 16 (wide)
         transmittance: wp.array2d[float],  # [H, W]
-        v_transmittance: wp.array2d[float],  # [H, W] its gradient
+        v_alpha: wp.array2d[float],  # [H, W] gradient of 1 - transmittance
         last: wp.array2d[int],  # [H, W] last contributor, counted from its tile's first, -1 = none
         v_image: wp.array3d[float],  # [H, W, 3] gradient of the image
         pixels: wp.array3d[Lanes],  # [H, W, S] the same (wide)
@@ -88,7 +88,7 @@ def make_composite_backward(wide: bool, depth: bool, absolute: bool) -> wp.Kerne
             splats,
             features,
             transmittance,
-            v_transmittance,
+            v_alpha,
             last,
             v_image,
             pixels,

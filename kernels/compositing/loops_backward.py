@@ -103,7 +103,7 @@ OPEN = """
         row_ends[row] = __builtin_reduce_max(ends[row]);
         tile_end = row_ends[row] > tile_end ? row_ends[row] : tile_end;
         lights[row] = read(transmittance.data + pixel, one);
-        behind[row] = read(v_transmittance.data + pixel, zero);
+        behind[row] = zero - read(v_alpha.data + pixel, zero);
         if (DEPTH) v_depths[row] = read(v_depth.data + pixel, zero);
 #if !SGWARP_WIDE
         const float* const from = v_image.data + 3 * pixel;
@@ -258,7 +258,7 @@ def patch_replay(wide: bool, depth: bool, absolute: bool, min_passed: float) -> 
         splats: wp.array[Splat],  # [V]
         features: wp.array3d[Lanes],  # [N, S, 1] (wide)
         transmittance: wp.array2d[float],  # [H, W]
-        v_transmittance: wp.array2d[float],  # [H, W]
+        v_alpha: wp.array2d[float],  # [H, W]
         last: wp.array2d[int],  # [H, W]
         v_image: wp.array3d[float],  # [H, W, 3]
         pixels: wp.array3d[Lanes],  # [H, W, S] (wide)

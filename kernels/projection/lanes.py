@@ -96,6 +96,7 @@ PROJECT = (
     + """
     const auto magnitude = [](Row x) -> Row { return __builtin_elementwise_abs(x); };
     const auto larger = [](Row x, Row y) -> Row { return x > y ? x : y; };
+    const auto smaller = [](Row x, Row y) -> Row { return x < y ? x : y; };
     const float largest_float = 3.4028234e38f;
 
     // Why each is left out: the first reason that holds.
@@ -110,7 +111,9 @@ PROJECT = (
     const Row length2 = quat[0] * quat[0] + quat[1] * quat[1] + quat[2] * quat[2] + quat[3] * quat[3];
     Row total = magnitude(given[0]) + length2;
     for (int j = 0; j < 3; ++j) total += magnitude(mean[j]) + magnitude(scale[j]);
+    const Row least = smaller(smaller(scale[0], scale[1]), smaller(scale[2], given[0]));
     leave_out(~(total <= largest_float) | ~(length2 >= MIN_NORM2), NON_FINITE);
+    if (bits((least < zero) | (given[0] > 1.0f))) invalid_out.data[0] = 1;  // NaN is not
     leave_out(given[0] < knobs.alpha_min, TRANSPARENT);
 
     POINT
@@ -246,6 +249,7 @@ def project_group(
     splats_out: wp.array[Splat],
     status_out: wp.array[wp.uint8],
     depths_out: wp.array[float],
+    invalid_out: wp.array[int],
 ): ...
 
 
@@ -265,6 +269,7 @@ def project_groups(
     splats_out: wp.array[Splat],  # [N] valid where visible, with colours if asked for
     status_out: wp.array[wp.uint8],  # [N] VISIBLE or why not
     depths_out: wp.array[float],  # [N] z in the camera frame [m], where visible
+    invalid_out: wp.array[int],  # [1] set if some scale is negative or opacity outside [0, 1]
 ):
     """Project a few times 16 Gaussians (paper eq. 2, 3) and decide whether any pixel can see them."""
     project_group(
@@ -280,4 +285,5 @@ def project_groups(
         splats_out,
         status_out,
         depths_out,
+        invalid_out,
     )

@@ -166,7 +166,7 @@ class GaussianRasterizer(torch.nn.Module):
         if wants_depth:
             values = torch.cat([values, 1.0 / p.depths[:, None]], dim=1)
         job = SplatJob(width, height, RasterSettings(alpha_max=ALPHA_MAX))
-        layers, transmittance, _ = composite_splats(centres, p.factors, opacity, values, p.depths, job)
+        layers, transmittance, _, _ = composite_splats(centres, p.factors, opacity, values, p.depths, job)
         image = layers[..., :channels] + transmittance[..., None] * settings.bg.to(layers)
         found = image.permute(2, 0, 1).contiguous(), _radii(p, len(means3D))
         return (*found, layers[..., channels:].permute(2, 0, 1).contiguous()) if wants_depth else found

@@ -15,7 +15,7 @@ from sgwarp.errors import InputError
 from sgwarp.network.augmentation import Augmentation
 from sgwarp.network.layers.mink_unet import ARCHITECTURES, Architecture
 from sgwarp.network.training.processes import joined
-from sgwarp.ops import launcher
+from sgwarp.ops import devices
 
 
 @pytest.fixture
@@ -110,14 +110,14 @@ class Words:
 )
 def test_other_devices_are_refused(name, message, pretended_cuda):
     with pytest.raises(InputError, match=message):
-        launcher.find_device(name)
+        devices.find_device(name)
 
 
 def test_a_driver_that_warp_does_not_take_is_named(make_scene, monkeypatch, pretended_cuda):
     scene = make_scene("sh3")
     there = scene.gaussians.to("cuda")
-    monkeypatch.setattr(launcher.wp, "is_cuda_available", lambda: False)
-    for call in (lambda: launcher.find_device("cuda"), lambda: sg.render(there, scene.camera)):
+    monkeypatch.setattr(devices.wp, "is_cuda_available", lambda: False)
+    for call in (lambda: devices.find_device("cuda"), lambda: sg.render(there, scene.camera)):
         with pytest.raises(InputError, match="driver of version 580"):
             call()
 

@@ -65,6 +65,8 @@ def project(scene: Gaussians, settings: RasterSettings, kernel: wp.Kernel, count
     memory, status = torch.zeros(16 * n, dtype=torch.int32), torch.zeros(n, dtype=torch.uint8)
     depths = torch.zeros(n)
     outputs = [tiles.view_splats(memory), view(status, wp.uint8), view(depths, wp.float32)]
+    if degree is not None:
+        outputs.append(view(torch.zeros(1, dtype=torch.int32), wp.int32))
     launch(kernel, count, inputs(scene, settings, degree), outputs, device=CPU)
     return memory.view(torch.float32).view(n, 16)[:, : len(FIELDS)], status, depths
 
@@ -139,6 +141,7 @@ def test_colors_on_the_way(case, coefficients, degree):
     _, status, _ = project(scene, settings, projection_lanes.project_groups, groups, -1)
     memory, status_out = torch.zeros(16 * n, dtype=torch.int32), torch.zeros(n, dtype=torch.uint8)
     outputs = [tiles.view_splats(memory), view(status_out, wp.uint8), view(torch.zeros(n), wp.float32)]
+    outputs.append(view(torch.zeros(1, dtype=torch.int32), wp.int32))
     launch(projection_lanes.project_groups, groups, inputs(scene, settings, degree), outputs, device=CPU)
     usable = torch.isfinite(sh[:, : (degree + 1) ** 2]).flatten(1).all(dim=1)
     seen = status == int(projection.VISIBLE)
@@ -149,6 +152,19 @@ def test_colors_on_the_way(case, coefficients, degree):
     torch.testing.assert_close(colors, tiles.shade(scene, camera(), order, degree), rtol=1e-5, atol=1e-5)
 
 
+@pytest.mark.parametrize("field", ["scales", "opacities"])
+@pytest.mark.parametrize("value", [-1e-6, 1.0, 1.001, float("nan"), float("inf"), -float("inf")])
+@pytest.mark.parametrize("at", [0, 15, 16, 32])
+def test_what_no_scene_may_hold_is_noticed(field, value, at):
+    """A negative scale, an opacity outside [0, 1], wherever it is; NaN is not taken for one."""
+    scene = cloud(33, 0.05, 1.0, False)
+    values = getattr(scene, field).clone()
+    values.view(33, -1)[at, -1] = value
+    fields = {name: getattr(scene, name) for name in ("means", "quats", "scales", "opacities", "sh")} | {field: values}
+    projected = tiles.project(Gaussians.unchecked(**fields), camera(), RasterSettings())
+    assert bool(projected.invalid[0]) == (value < 0 or (field == "opacities" and value > 1))
+
+
 @pytest.mark.parametrize("n", [0, 1, 5000])
 def test_depth_order(n):
     """By depth, those at the same depth by index; whatever sign, however near."""
@@ -156,7 +172,9 @@ def test_depth_order(n):
     depths = torch.randn(n, generator=g) * 10.0 ** torch.randint(-30, 30, (n,), generator=g)
     depths[: n // 2] = depths[: n // 2].sign() * torch.randint(1, 9, (n // 2,), generator=g)
     status = torch.randint(0, 3, (n,), generator=g).to(torch.uint8)
-    projected = tiles.Projected(tiles.view_splats(torch.zeros(16 * n, dtype=torch.int32)), status, depths)
+    counted = torch.full((len(projection.STATUS_NAMES),), -1)
+    projected = tiles.Projected(tiles.view_splats(torch.zeros(16 * n, dtype=torch.int32)), status, depths, counted)
     order = tiles.depth_order(projected).clone()
+    assert projected.counts().tolist() == [int((status == k).sum()) for k in range(len(counted))]
     expected = sorted((depth, i) for i, depth in enumerate(depths.tolist()) if status[i] == int(projection.VISIBLE))
     assert order.tolist() == [i for _, i in expected]

@@ -241,9 +241,8 @@ def _render(
         values = depths
     elif wants_depth and not job.wants_depth:
         values = torch.cat([values, depths], dim=1)
-    image, transmittance, depth = composite_splats(centres, p.factors, opacities, values, p.depths, job)
-    transmittance = transmittance[..., None]
-    alpha = 1.0 - transmittance
+    image, transmittance, alpha, depth = composite_splats(centres, p.factors, opacities, values, p.depths, job)
+    transmittance, alpha = transmittance[..., None], alpha[..., None]
     depth = depth[..., None] if job.wants_depth else image[..., channels:]
     image = image[..., :channels]
     if background is not None and channels:

@@ -155,13 +155,13 @@ def rasterize_to_pixels(
         receive = None if absolute is None else _writer(absolute[first:last])
         job = SplatJob(image_width, image_height, given=ListedSplats(listed - first, offsets), receive_absolute=receive)
         nothing = torch.zeros(last - first, device=means2d.device)
-        image, transmittance, _ = composite_splats(
+        image, transmittance, alpha, _ = composite_splats(
             part[0], factors_from_conics(part[1]), part[3], part[2], nothing, job
         )
         if backgrounds is not None:
             image = image + transmittance[..., None] * backgrounds.reshape(count, channels)[i]
         colors_out.append(image)
-        alphas_out.append(1.0 - transmittance[..., None])
+        alphas_out.append(alpha[..., None])
     shape = (*lead, image_height, image_width)
     return torch.stack(colors_out).reshape(*shape, channels), torch.stack(alphas_out).reshape(*shape, 1)
 

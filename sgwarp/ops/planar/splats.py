@@ -26,7 +26,7 @@ from sgwarp.ops.launcher import launch
 from sgwarp.ops.planar.projection import FACTOR_UNIT
 from sgwarp.ops.splatting import backward, tiles
 from sgwarp.ops.splatting.forward import composite, composite_recorded
-from sgwarp.ops.splatting.gradients import ImageGradients
+from sgwarp.ops.splatting.gradients import ImageGradients, gradient_of_alpha
 from sgwarp.ops.splatting.settings import RasterSettings
 from sgwarp.scene import Camera
 
@@ -97,7 +97,7 @@ def composite_splats(
     features: Tensor,
     depths: Tensor,
     job: SplatJob,
-) -> tuple[Tensor, Tensor, Tensor]:
+) -> tuple[Tensor, Tensor, Tensor, Tensor]:
     """Composite splats front to back (paper eq. 1), with gradients to every tensor.
 
     Splats that are not finite or fainter than `alpha_min` are left out and get gradients of zero.
@@ -111,8 +111,8 @@ def composite_splats(
         job: The rest.
 
     Returns:
-        sum of alpha T features, float32 [H, W, C]; remaining transmittance, float32 [H, W]; and sum of alpha T depth,
-        float32 [H, W], or empty unless asked for.
+        sum of alpha T features, float32 [H, W, C]; remaining transmittance and accumulated opacity,
+        float32 [H, W]; and sum of alpha T depth, float32 [H, W], or empty unless asked for.
     """
     return _CompositeSplats.apply(means2d, factors, opacities, features, depths, job)
 
@@ -129,7 +129,7 @@ class _CompositeSplats(torch.autograd.Function):
         features: Tensor,
         depths: Tensor,
         job: SplatJob,
-    ) -> tuple[Tensor, Tensor, Tensor]:
+    ) -> tuple[Tensor, Tensor, Tensor, Tensor]:
         keep = any(ctx.needs_input_grad)
         camera, settings = _frame(job.width, job.height), job.settings
         values, finite = _finite_rows(features)
@@ -143,7 +143,7 @@ class _CompositeSplats(torch.autograd.Function):
         job.lists = lists
         if not keep:
             image, transmittance, depth_sum, _ = composite(lists, camera, settings, values, job.wants_depth)
-            return image, transmittance, depth_sum
+            return image, transmittance, 1.0 - transmittance, depth_sum
         image, transmittance, depth_sum, _, last, hit = composite_recorded(
             lists, camera, settings, values, job.wants_depth
         )
@@ -151,12 +151,16 @@ class _CompositeSplats(torch.autograd.Function):
         ctx.save_for_backward(means2d, factors, opacities, features, depths, *recorded, *vars(lists).values())
         ctx.job = job
         ctx.set_materialize_grads(False)
-        return image, transmittance, depth_sum
+        return image, transmittance, 1.0 - transmittance, depth_sum
 
     @staticmethod
     @torch.autograd.function.once_differentiable
     def backward(
-        ctx: Any, v_image: Tensor | None, v_transmittance: Tensor | None, v_depth_sum: Tensor | None
+        ctx: Any,
+        v_image: Tensor | None,
+        v_transmittance: Tensor | None,
+        v_alpha: Tensor | None,
+        v_depth_sum: Tensor | None,
     ) -> tuple[Tensor | None, ...]:
         job: SplatJob = ctx.job
         means2d, factors, opacities, features, depths, *kept = ctx.saved_tensors
@@ -167,7 +171,9 @@ class _CompositeSplats(torch.autograd.Function):
             _finite_rows(features)[0],
             features.shape[1],
             (kept[0], kept[1], kept[2]),
-            ImageGradients(v_image, v_transmittance, v_depth_sum if job.wants_depth else None),
+            ImageGradients(
+                v_image, gradient_of_alpha(v_alpha, v_transmittance), v_depth_sum if job.wants_depth else None
+            ),
             len(means2d),
             absolute=job.receive_absolute is not None,
         )

@@ -18,7 +18,7 @@ from sgwarp.ops.splatting.forward import (
     require_finite_features,
     runs_in_blocks,
 )
-from sgwarp.ops.splatting.gradients import ImageGradients
+from sgwarp.ops.splatting.gradients import ImageGradients, gradient_of_alpha
 from sgwarp.ops.splatting.loading import load_rendering
 from sgwarp.ops.splatting.plan import RenderPlan, plan_render
 from sgwarp.ops.splatting.room import ListRoom
@@ -163,12 +163,11 @@ def rasterize(
     means, quats, scales, opacities, values = (
         t.to(torch.float32).contiguous() for t in (means, quats, scales, opacities, values)
     )
-    image, transmittance, depth_sum, surface = _Rasterize.apply(
+    image, transmittance, alpha, depth_sum, surface = _Rasterize.apply(
         means, quats, scales, opacities, values, viewmat, means2d, request
     )
     if background is not None:
         image = image + transmittance[..., None] * background.to(image)
-    alpha = 1.0 - transmittance
     mean_depth = None
     if expected_depth:
         mean_depth = torch.where(alpha > 0, depth_sum / alpha.clamp(min=1e-12), 0.0)
@@ -190,19 +189,22 @@ def _as_gaussians(*fields: Tensor) -> Gaussians:
 
 
 def _check_fields(means: Tensor, quats: Tensor, scales: Tensor, opacities: Tensor) -> None:
-    """Shapes and types always; values on the CPU only, since on CUDA to look at them is to wait for the device."""
+    """Refuse shapes and types that do not fit; `_check_values` looks at values."""
     n = len(means)
     fields = {"means": (means, (n, 3)), "quats": (quats, (n, 4)), "scales": (scales, (n, 3))}
     for name, (tensor, shape) in (fields | {"opacities": (opacities, (n,))}).items():
         if tuple(tensor.shape) != shape or not tensor.is_floating_point():
             got = f"{tensor.dtype} {list(tensor.shape)}"
             raise InputError(f"{name}: expected floating point {list(shape)}, got {got}")
-    if n == 0 or means.is_cuda:
-        return
-    with torch.no_grad():
-        lowest, highest = opacities.aminmax()
-        if not (scales.min() >= 0 and lowest >= 0 and highest <= 1):  # or NaN, which is no error
-            Gaussians(means, quats, scales, opacities, means.new_zeros(n, 1, 3))
+
+
+def _check_values(gaussians: Gaussians, projected: tiles.Projected) -> None:
+    """Refuse negative scales and opacities outside [0, 1], on the CPU: on CUDA to look is to wait for the device.
+
+    The projection has looked at them already.
+    """
+    if projected.invalid is not None and projected.invalid[0]:
+        Gaussians(*(getattr(gaussians, name) for name in ("means", "quats", "scales", "opacities", "sh")))
 
 
 @dataclass(eq=False)
@@ -238,7 +240,7 @@ class _Rasterize(torch.autograd.Function):
         world_to_camera: Tensor,
         means2d: Tensor | None,
         request: _Request,
-    ) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+    ) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor]:
         camera, settings = request.camera, request.settings
         gaussians = _gaussians(means, quats, scales, opacities, values, request)
         features = None if request.harmonics else values
@@ -253,6 +255,7 @@ class _Rasterize(torch.autograd.Function):
         projected = tiles.project(gaussians, camera, settings, degree=request.plan.colored, look=False)
         tiles.leave_out_non_finite(projected, features)
         order = tiles.depth_order(projected)
+        _check_values(gaussians, projected)
         colors = packed_colors(gaussians, camera, features, order, request.plan)
         block = runs_in_blocks(means.device, request.schedule)
         lists = tiles.bin_splats(
@@ -276,7 +279,7 @@ class _Rasterize(torch.autograd.Function):
         ctx.request = request
         ctx.channels = image.shape[2]
         ctx.set_materialize_grads(False)
-        return image, transmittance, depth_sum, surface
+        return image, transmittance, 1.0 - transmittance, depth_sum, surface
 
     @staticmethod
     @torch.autograd.function.once_differentiable
@@ -284,6 +287,7 @@ class _Rasterize(torch.autograd.Function):
         ctx: Any,
         v_image: Tensor | None,
         v_transmittance: Tensor | None,
+        v_alpha: Tensor | None,
         v_depth_sum: Tensor | None,
         v_surface: Tensor | None,
     ) -> tuple[Tensor | None, ...]:
@@ -292,7 +296,7 @@ class _Rasterize(torch.autograd.Function):
         means, quats, scales, opacities, values, world_to_camera, *kept = ctx.saved_tensors
         gaussians = _gaussians(means, quats, scales, opacities, values, request)
         recorded, lists = (kept[0], kept[1], kept[2]), tiles.TileLists(*kept[3:])
-        gradients = ImageGradients(v_image, v_transmittance, v_depth_sum, v_surface)
+        gradients = ImageGradients(v_image, gradient_of_alpha(v_alpha, v_transmittance), v_depth_sum, v_surface)
         pose, absolute, degree = ctx.needs_input_grad[5], request.receives_absgrad is not None, request.plan.sh_degree
         features = None if request.harmonics else values
         compositing = (lists, camera, settings, features, ctx.channels, recorded, gradients)

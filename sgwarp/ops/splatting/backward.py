@@ -100,13 +100,13 @@ def _replay_blocks(
     """`SplatGradients.sums` by the block schedule."""
     device, wide = lists.order.device, channels > 3
     transmittance, last, _ = recorded
-    v_image, v_transmittance, v_depth = gradients.images(transmittance, channels)
+    v_image, v_alpha, v_depth = gradients.images(transmittance, channels)
     depth = gradients.depth_sum is not None or gradients.surface is not None
     slices = in_slices(features if wide and features is not None else v_depth[:1, :1])
     pixels = in_slices(v_image if wide else v_depth[:0, :0, None])
     sums = torch.zeros(count, LANE, device=device)
     rows = scratch("backward rows", lists.intersections * LANE if ordered else 0, torch.float32, device).view(-1, LANE)
-    images = [view(t.contiguous(), wp.float32) for t in (transmittance, v_transmittance, v_image)]
+    images = [view(t.contiguous(), wp.float32) for t in (transmittance, v_alpha, v_image)]
     by_four = (view(t.flatten(-2).unflatten(-1, (-1, 4)), wp.vec4) for t in (slices, pixels))
     features_by_four, v_features = by_four
     inputs = [*lists.arrays(), features_by_four, *images, v_features, view(v_depth.contiguous(), wp.float32)]

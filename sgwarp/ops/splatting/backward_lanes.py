@@ -69,7 +69,7 @@ def replay(
     """Replay the tiles from their last fragments to their first (CPU); arguments as in `composite_backward`."""
     device, wide = lists.order.device, channels > 3
     transmittance, last, _ = recorded
-    v_image, v_transmittance, v_depth = gradients.images(transmittance, channels)
+    v_image, v_alpha, v_depth = gradients.images(transmittance, channels)
     depth = gradients.depth_sum is not None or gradients.surface is not None
     slices = in_slices(features if wide and features is not None else v_depth[:1, :1])
     pixels = in_slices(v_image if wide else v_depth[:0, :0, None])
@@ -81,7 +81,7 @@ def replay(
     narrow = v_depth[:0, :0, None] if wide else v_image
     if channels < 3:
         narrow = pad(narrow, (0, 3 - channels))
-    maps = [view(t.contiguous(), wp.float32) for t in (transmittance, v_transmittance)]
+    maps = [view(t.contiguous(), wp.float32) for t in (transmittance, v_alpha)]
     maps += [view(last, wp.int32), view(narrow.contiguous(), wp.float32), view(pixels, Lanes)]
     maps += [view((v_depth if depth else v_depth[:0]).contiguous(), wp.float32)]
     gradient = lane_scratch("backward gradient", TILE_ROWS, slices.shape[1] * LANE if wide else 0, device)

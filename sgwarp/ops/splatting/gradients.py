@@ -14,23 +14,30 @@ class ImageGradients:
 
     Attributes:
         features: float32 [H, W, C].
-        transmittance: float32 [H, W].
+        alpha: Of the accumulated opacity, float32 [H, W].
         depth_sum: Of sum alpha T z, float32 [H, W].
         surface: Of the surface depth, float32 [H, W].
     """
 
     features: Tensor | None = None
-    transmittance: Tensor | None = None
+    alpha: Tensor | None = None
     depth_sum: Tensor | None = None
     surface: Tensor | None = None
 
     def images(self, transmittance: Tensor, channels: int) -> tuple[Tensor, Tensor, Tensor]:
-        """Gradients of features, transmittance and depth sum; zeros of their shape where there are none."""
+        """Gradients of features, alpha and depth sum; zeros of their shape where there are none."""
         zeros = torch.zeros((), device=transmittance.device)
         v_image = zeros.expand(*transmittance.shape, channels) if self.features is None else self.features
-        others = (self.transmittance, self.depth_sum)
-        v_transmittance, v_depth = (zeros.expand_as(transmittance) if t is None else t for t in others)
-        return v_image, v_transmittance, v_depth
+        others = (self.alpha, self.depth_sum)
+        v_alpha, v_depth = (zeros.expand_as(transmittance) if t is None else t for t in others)
+        return v_image, v_alpha, v_depth
+
+
+def gradient_of_alpha(v_alpha: Tensor | None, v_transmittance: Tensor | None) -> Tensor | None:
+    """The gradient of alpha from its own and that of the transmittance, 1 - alpha; None is zero."""
+    if v_transmittance is None:
+        return v_alpha
+    return -v_transmittance if v_alpha is None else v_alpha - v_transmittance
 
 
 @dataclass(frozen=True, eq=False)

@@ -39,13 +39,17 @@ class Projected:
     splats: Any  # Splat [N], as kernels take it
     status: Tensor  # uint8 [N], see kernels/projection.py
     depths: Tensor  # float32 [N] z [m], valid where visible
+    counted: Tensor | None = None  # int64 per status, on the CPU, valid once ordered; its own memory
+    invalid: Tensor | None = None  # int32 [1], on the CPU, whether some scale is negative or opacity outside [0, 1]
 
     def counts(self) -> Tensor:
         """Number of Gaussians per status, int64; on CUDA the host waits only when it is read."""
         if self.status.device.type == "cuda":
             names = torch.arange(len(projection.STATUS_NAMES), device=self.status.device)
             return (self.status[:, None] == names).sum(dim=0)
-        return torch.bincount(self.status, minlength=len(projection.STATUS_NAMES))
+        if self.counted is None:
+            return torch.bincount(self.status, minlength=len(projection.STATUS_NAMES))
+        return self.counted
 
 
 def culled(counts: Tensor) -> dict[str, int]:
@@ -196,11 +200,17 @@ def project(
         return Projected(splats, status, depths)
     read = -1 if degree is None else degree
     inputs += [view(gaussians.sh, wp.vec3), read, *seen_by]
+    invalid = torch.zeros(1, dtype=torch.int32, device=device)
+    outputs.append(view(invalid, wp.int32))
     launch(projection_lanes.project_groups, -(-n // GROUP), inputs, outputs, device=device)
     # The kernel left out those whose coefficients it read are not finite. There may be others.
     if (look or (read + 1) ** 2 < gaussians.sh.shape[1]) and gaussians.colors_may_be_non_finite:
         status.masked_fill_(~gaussians.finite, int(projection.NON_FINITE))
-    return Projected(splats, status, depths)
+    return Projected(splats, status, depths, _status_counts(device), invalid)
+
+
+def _status_counts(device: torch.device) -> Tensor:
+    return torch.empty(len(projection.STATUS_NAMES), dtype=torch.int64, device=device)
 
 
 def mark_non_finite_colors(sh: Tensor, status: Tensor) -> None:
@@ -224,10 +234,12 @@ def depth_order(projected: Projected) -> Tensor:
         return shown.argsort(stable=True).to(torch.int32)
     n = len(projected.status)
     pairs, order = scratch("depth pairs", 2 * n, torch.int64, device), scratch("order", n, torch.int32, device)
-    count = torch.empty(1, dtype=torch.int32, device=device)
+    counted = projected.counted
+    if counted is None:
+        counted = _status_counts(device)
     inputs = [view(projected.status, wp.uint8), view(projected.depths, wp.float32), view(pairs, wp.uint64)]
-    launch(ordering_lanes.sort_depths, 1, inputs, [view(order, wp.int32), view(count, wp.int32)], device=device)
-    return order[: int(count)]
+    launch(ordering_lanes.sort_depths, 1, inputs, [view(order, wp.int32), view(counted, wp.int64)], device=device)
+    return order[: int(counted[projection.VISIBLE])]
 
 
 def shade(gaussians: Gaussians, camera: Camera, order: Tensor, degree: int) -> Tensor:
@@ -303,7 +315,7 @@ def bin_by_counting(
     """Count and fill in slices of the depth order (CPU)."""
     device, count, grid = order.device, len(order), _tile_count(camera)
     per_slice = max(1, -(-count // SLICES))
-    cursors = scratch("tile counts", SLICES * grid, torch.int32, device).view(SLICES, grid).zero_()
+    cursors = scratch("tile counts", SLICES * grid, torch.int32, device).view(SLICES, grid)
     totals = torch.zeros(SLICES + 1, 2, dtype=torch.int64, device=device)
     sizes = [per_slice, camera.width, camera.height]
     splats = view_splats(memory)
@@ -312,7 +324,9 @@ def bin_by_counting(
     words = binning_lanes.SPAN_WORDS * count
     kept = [view(scratch("spans", words, torch.int64, device), wp.uint64)]
     kept += [view(scratch(name, count, torch.int32, device), wp.int32) for name in ("tile rows", "tile patches")]
-    outputs = [splats, *shared, *kept]
+    ranges = _integers("row ranges", 2 * (len(projected.status) + 1) if rows else 0, device, keep).view(-1, 2)
+    ranged = view(ranges, wp.int32)
+    outputs = [splats, *shared, *kept, ranged]
     launch(binning_lanes.count_tiles, SLICES, inputs, outputs, device=device, chunk=1)
     offsets = torch.empty(grid + 1, dtype=torch.int32, device=device)
     launch(binning_lanes.place_slices, 1, [], [*shared, view(offsets, wp.int32)], device=device)
@@ -324,14 +338,13 @@ def bin_by_counting(
         "places": total if places else 0,
         "entry tiles": total if tiles else 0,
         "row places": 2 * count if rows else 0,
-        "row ranges": 2 * (len(projected.status) + 1) if rows else 0,
     }
-    listed, entries, places_of, tiles_of, row_places, ranges = (
+    listed, entries, places_of, tiles_of, row_places = (
         _integers(name, length, device, keep) for name, length in lengths.items()
     )
-    row_places, ranges = row_places.view(-1, 2), ranges.zero_().view(-1, 2)
+    row_places = row_places.view(-1, 2)
     inputs = [view(order, wp.int32), splats, *sizes, shared[1], *kept, shared[0]]
-    outputs = [view(t, wp.int32) for t in (listed, entries, places_of, tiles_of, row_places, ranges)]
+    outputs = [*(view(t, wp.int32) for t in (listed, entries, places_of, tiles_of, row_places)), ranged]
     launch(binning_lanes.fill_tiles, SLICES, inputs, outputs, device=device, chunk=1)
     return TileLists(order, memory, offsets, listed, entries, places_of, tiles_of, row_places, ranges)
 

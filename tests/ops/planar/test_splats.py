@@ -38,7 +38,7 @@ def composite_scene(gaussians, camera, features, wants_depth=False):
 def test_images_and_gradients_match_the_oracle(scene, channels):
     _, gaussians, camera = scene
     features = torch.rand(len(gaussians), channels, generator=torch.Generator().manual_seed(1))
-    leaves, (image, T, depth), _, _ = composite_scene(gaussians, camera, features, wants_depth=True)
+    leaves, (image, T, alpha, depth), _, _ = composite_scene(gaussians, camera, features, wants_depth=True)
     wanted = [t.detach().double().requires_grad_() for t in leaves]
     projection = reference.project(*wanted[:4], camera.world_to_camera, camera.K, camera.width, camera.height)
     expected = reference.composite(projection, wanted[4], camera.width, camera.height)
@@ -48,8 +48,9 @@ def test_images_and_gradients_match_the_oracle(scene, channels):
     torch.testing.assert_close(depth.double()[clear], depth_sum[clear], rtol=2e-5, atol=2e-4)
     rng = torch.Generator().manual_seed(2)
     w, v = torch.rand(image.shape, generator=rng) * clear[..., None], torch.rand(T.shape, generator=rng) * clear
-    ((image * w).sum() + (T * v).sum() + 0.1 * (depth * v).sum()).backward()
+    ((image * w).sum() + (T * v).sum() + 3 * (alpha * v * v).sum() + 0.1 * (depth * v).sum()).backward()
     loss = (expected.features * w.double()).sum() + ((1 - expected.alpha) * v.double()).sum()
+    loss = loss + 3 * (expected.alpha * v.double() ** 2).sum()
     (loss + 0.1 * (depth_sum * v.double()).sum()).backward()
     for leaf, got, want in zip(LEAVES, leaves, wanted, strict=True):
         assert (got.grad - want.grad).abs().max() <= 1e-3 * want.grad.abs().max(), leaf
@@ -65,7 +66,7 @@ def test_same_bits_for_any_number_of_threads(make_scene, monkeypatch):
     try:
         for count in (1, 3):
             launcher.set_threads(count)
-            leaves, (image, _, _), _, _ = composite_scene(gaussians, camera, features)
+            leaves, (image, *_), _, _ = composite_scene(gaussians, camera, features)
             image.square().sum().backward()
             found.append([image.detach(), *(leaf.grad for leaf in leaves)])
     finally:
@@ -78,7 +79,7 @@ def test_given_lists_are_followed(make_scene):
     """Lists of the rasterizer's own give its image and gradients again; reversed lists give another image."""
     _, gaussians, camera = make_scene("odd_size")
     features = torch.rand(len(gaussians), 3)
-    leaves, (image, _, _), job, p = composite_scene(gaussians, camera, features)
+    leaves, (image, *_), job, p = composite_scene(gaussians, camera, features)
     image.square().sum().backward()
     own = ListedSplats(listed_rows(job.lists), job.lists.offsets.clone())
     splats = (p.means2d, p.conics, leaves[3][p.index], leaves[4][p.index])
@@ -108,7 +109,7 @@ def test_splats_that_cannot_be_seen_are_skipped():
     for given in (None, lists):
         job = SplatJob(16, 16, given=given)
         means2d, conics, opacities, values = leaves
-        image, T, _ = composite_splats(means2d, factors_from_conics(conics), opacities, values, torch.ones(5), job)
+        image, T, _, _ = composite_splats(means2d, factors_from_conics(conics), opacities, values, torch.ones(5), job)
         torch.testing.assert_close(1 - T, image[..., 0])
         assert 0.7 < 1 - T[8, 8] < 0.8
         gradients = torch.autograd.grad(image.sum(), leaves)
@@ -122,7 +123,9 @@ def test_clamped_opacity_has_no_gradient():
     job = SplatJob(16, 16, RasterSettings(alpha_max=0.5))
     opacities = torch.tensor([0.9]).requires_grad_()
     factors = factors_from_conics(torch.tensor([[1e-6, 0.0, 1e-6]]))
-    image, T, _ = composite_splats(torch.tensor([[8.0, 8.0]]), factors, opacities, torch.ones(1, 1), torch.ones(1), job)
+    image, T, _, _ = composite_splats(
+        torch.tensor([[8.0, 8.0]]), factors, opacities, torch.ones(1, 1), torch.ones(1), job
+    )
     assert (T == 0.5).all()
     image.sum().backward()
     assert opacities.grad.item() == 0.0
