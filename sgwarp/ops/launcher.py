@@ -7,6 +7,7 @@ threads take chunks in turn; every kernel writes disjoint memory, so the result 
 from __future__ import annotations
 
 import copy
+import ctypes
 import itertools
 import os
 import threading
@@ -153,17 +154,11 @@ def launch(
     recorded = mended(kernel, lambda: wp.launch(kernel, count, arguments, device="cpu", record_cmd=True))
 
     def work(slot: int) -> None:
-        command, held = _own(recorded, 1 + slots), 0
+        command = _Command(recorded)
         if slots:
-            command.set_param_at_index_from_ctype(1, slot)
+            command.set_number(1, slot)
         while (number := next(ticket)) < len(chunks) and not unwanted():
-            # Others wait for the interpreter meanwhile: as few steps as possible.
-            base, size = chunks[number]
-            if size != held:
-                command.set_dim(size)
-                held = size
-            command.set_param_at_index_from_ctype(0, base)
-            command.launch()
+            command.run(*chunks[number])
 
     helpers = [_executor().submit(work, slot) for slot in range(1, threads)]
     try:
@@ -175,14 +170,38 @@ def launch(
         raise Interrupted
 
 
-def _own(recorded: Any, numbers: int) -> Any:
-    """The recorded launch with a size and the first `numbers` parameters of its own; all else is shared."""
-    command = copy.copy(recorded)
-    command.params = list(recorded.params)
-    for k in range(1, 1 + numbers):  # behind the bounds, which `set_dim` replaces
-        command.params[k] = type(command.params[k])()
-    command.fwd_args = None
-    return command
+class _Command:
+    """A recorded launch of the CPU, for one host thread: it has a length and numbers of its own.
+
+    Warp's own `Launch.launch` packs every argument anew each time, for which all host threads wait. This calls the
+    compiled function as that does, with the arguments packed once.
+    """
+
+    def __init__(self, recorded: Any) -> None:
+        self._recorded, self._size = copy.copy(recorded), 0
+        self._recorded.params, self._recorded.fwd_args = list(recorded.params), None
+        values = recorded.params[1:]  # behind the bounds
+        labels = [argument.label for argument in recorded.kernel.adj.args]
+        self._arguments = _structure(tuple(zip(labels, map(type, values), strict=True)))(*values)
+        self._first, self._pointer = labels[0], ctypes.byref(self._arguments)
+
+    def set_number(self, place: int, value: int) -> None:
+        """Set the argument at this place, a number."""
+        setattr(self._arguments, self._recorded.kernel.adj.args[place].label, value)
+
+    def run(self, base: int, size: int) -> None:
+        """Run `size` kernel threads from `base` on."""
+        if size != self._size:
+            self._recorded.set_dim(size)
+            self._size = size
+        setattr(self._arguments, self._first, base)
+        self._recorded.hooks.forward(ctypes.byref(self._recorded.params[0]), self._pointer)
+
+
+@lru_cache(maxsize=1024)
+def _structure(fields: tuple[tuple[str, Any], ...]) -> Any:
+    """The arguments of a kernel as the compiled function takes them."""
+    return type("Arguments", (ctypes.Structure,), {"_fields_": fields})
 
 
 @lru_cache(maxsize=256)

@@ -137,7 +137,7 @@ class _CompositeSplats(torch.autograd.Function):
         if job.given is not None:
             lists = _follow(job.given, projected, values, camera)
         else:
-            order = tiles.depth_order(projected)
+            order = tiles.depth_order(projected, keep=keep)
             colors = _padded(values[order.to(torch.int64)]) if values.shape[1] <= 3 else None
             lists = tiles.bin_splats(projected, order, colors, camera, places=keep, rows=keep, keep=keep)
         job.lists = lists

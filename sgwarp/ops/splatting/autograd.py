@@ -254,7 +254,7 @@ class _Rasterize(torch.autograd.Function):
             )
         projected = tiles.project(gaussians, camera, settings, degree=request.plan.colored, look=False)
         tiles.leave_out_non_finite(projected, features)
-        order = tiles.depth_order(projected)
+        order = tiles.depth_order(projected, keep=True)
         _check_values(gaussians, projected)
         colors = packed_colors(gaussians, camera, features, order, request.plan)
         block = runs_in_blocks(means.device, request.schedule)

@@ -226,14 +226,17 @@ def leave_out_non_finite(projected: Projected, features: Tensor | None) -> None:
         projected.status.masked_fill_(~rows, int(projection.NON_FINITE))
 
 
-def depth_order(projected: Projected) -> Tensor:
-    """Visible Gaussians by (depth, index), int32 [V]; on CUDA all N, the culled last, so that nobody waits for V."""
+def depth_order(projected: Projected, *, keep: bool = False) -> Tensor:
+    """Visible Gaussians by (depth, index), int32 [V]; on CUDA all N, the culled last, so that nobody waits for V.
+
+    On the CPU it is scratch, valid until the next view, unless kept.
+    """
     device = projected.status.device
     if device.type == "cuda":
         shown = torch.where(projected.status == projection.VISIBLE, projected.depths, math.inf)
         return shown.argsort(stable=True).to(torch.int32)
     n = len(projected.status)
-    pairs, order = scratch("depth pairs", 2 * n, torch.int64, device), scratch("order", n, torch.int32, device)
+    pairs, order = scratch("depth pairs", 2 * n, torch.int64, device), _integers("order", n, device, keep)
     counted = projected.counted
     if counted is None:
         counted = _status_counts(device)
@@ -285,13 +288,12 @@ def bin_splats(
     """Write the tile lists of a view.
 
     `colors` [V, 3] travel with the splats; `places` and `tiles` of the entries and the `rows` of sums, on the CPU, are
-    filled only if asked for. With `keep` the lists have memory of their own: they outlive the view, as a backward pass
-    needs it. On CUDA nobody waits for the length of the lists if they are given a `room`.
+    filled only if asked for. With `keep` the lists have memory of their own, as the order then has: they outlive the
+    view, as a backward pass needs it. On CUDA nobody waits for the length of the lists if they are given a `room`.
     """
     device = order.device
     packed = view(torch.empty(0, 3, device=device) if colors is None else colors, wp.vec3)
     memory = splat_memory(len(order), device, None if keep else "ordered splats")
-    order = order.clone() if keep else order
     if device.type == "cuda":
         return bin_by_sorting(projected, order, packed, camera, memory, keep=keep, room=room)
     lists = bin_by_counting(projected, order, packed, camera, memory, places=places, tiles=tiles, rows=rows, keep=keep)
