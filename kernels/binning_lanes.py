@@ -187,6 +187,36 @@ FILL = (
 """
 )
 
+# Longest first, to an eighth of a power of two: the bits of a float that say that are few enough to count.
+ORDER_PATCHES = f"""
+    constexpr int TILE = {int(TILE)}, PATCH = {PATCH}, BINS = 1 << 11;
+    const int columns = (width + TILE - 1) / TILE, down = (height + TILE - 1) / TILE;
+    const int across = (columns + PATCH - 1) / PATCH, patches = order_out.shape[0];
+    const auto bin = [&](int patch) -> int {{
+        const int left = patch % across * PATCH, top = patch / across * PATCH;
+        const int right = left + PATCH < columns ? left + PATCH : columns;
+        const int bottom = top + PATCH < down ? top + PATCH : down;
+        int length = 0;
+        for (int row = top; row < bottom; ++row)
+            length += offsets.data[row * columns + right] - offsets.data[row * columns + left];
+        return BINS - 1 - (__builtin_bit_cast(int, (float)length) >> 20);
+    }};
+    int places[BINS] = {{}};
+    for (int patch = 0; patch < patches; ++patch) ++places[bin(patch)];
+    for (int k = 0, place = 0; k < BINS; ++k) {{
+        const int here = places[k];
+        places[k] = place, place += here;
+    }}
+    for (int patch = 0; patch < patches; ++patch) order_out.data[places[bin(patch)]++] = patch;
+    __builtin_memset(used_out.data, 0, used_out.shape[0]);
+"""
+
+
+@wp.func_native(ORDER_PATCHES)
+def put_longest_first(
+    offsets: wp.array[int], width: int, height: int, order_out: wp.array[int], used_out: wp.array[wp.uint8]
+): ...
+
 
 @wp.func_native(COUNT)
 def count_slice(
@@ -328,3 +358,18 @@ def fill_tiles(
         row_places_out,
         ranges_out,
     )
+
+
+@wp.kernel
+def order_patches(
+    # In:
+    base: int,  # 0: one thread does it all
+    offsets: wp.array[int],  # [tiles + 1]
+    width: int,  # [pixels]
+    height: int,
+    # Out:
+    order_out: wp.array[int],  # [patches] of tiles, those with the most intersections first
+    used_out: wp.array[wp.uint8],  # [R] cleared
+):
+    """Prepare the replay of the patches: threads that begin with the longest end together."""
+    put_longest_first(offsets, width, height, order_out, used_out)

@@ -56,8 +56,9 @@ def make_composite_backward(wide: bool, depth: bool, absolute: bool) -> wp.Kerne
     @wp.kernel(module="unique", module_options=LANE_OPTIONS, enable_backward=False)
     def composite_backward(
         # In:
-        base: int,  # first patch of this launch
+        base: int,  # first place in `order` of this launch
         slot: int,  # scratch of this launch
+        order: wp.array[int],  # [patches]
         offsets: wp.array[int],  # [tiles + 1]
         listed: wp.array[int],  # [I]
         row_places: wp.array2d[int],  # [V, 2] a, b: the row of sums in patch (r, c) is a + b r + c
@@ -81,7 +82,7 @@ def make_composite_backward(wide: bool, depth: bool, absolute: bool) -> wp.Kerne
         """Paper eq. 1, differentiated, for one patch of tiles per thread."""
         replay_patch(
             slot,
-            base + wp.tid(),
+            order[base + wp.tid()],
             offsets,
             listed,
             row_places,

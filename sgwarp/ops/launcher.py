@@ -120,7 +120,6 @@ def launch(
     device: torch.device,
     slots: bool = False,
     chunk: int | None = None,
-    order: Sequence[int] | None = None,
 ) -> None:
     """Run a kernel whose first argument is the first index of the launch.
 
@@ -129,7 +128,6 @@ def launch(
         count: Number of kernel threads.
         slots: Pass the number of the host thread, which names its scratch; less than `get_threads()`.
         chunk: Kernel threads per host launch, by default an eighth of a host thread's share, and less at the end.
-        order: In which to take the kernel threads one by one, on the CPU; the longest first, and all end together.
 
     Raises:
         Interrupted: In a block of `interruptible`.
@@ -149,7 +147,7 @@ def launch(
     if threads == 1:
         mended(kernel, lambda: wp.launch(kernel, count, arguments, device="cpu"))
         return
-    chunks = _chunks(count, threads, chunk) if order is None else tuple((base, 1) for base in order)
+    chunks = _chunks(count, threads, chunk)
     ticket = itertools.count()  # next() is atomic under the interpreter lock
     recorded = mended(kernel, lambda: wp.launch(kernel, count, arguments, device="cpu", record_cmd=True))
 

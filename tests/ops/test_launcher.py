@@ -39,15 +39,6 @@ def test_every_kernel_thread_runs_once(threads: int, count: int, chunk: int | No
     assert slots.max() < threads
 
 
-@pytest.mark.parametrize("threads", [1, 2, 3])
-def test_every_kernel_thread_of_an_order_runs_once(threads: int) -> None:
-    set_threads(threads)
-    order = torch.randperm(300, generator=torch.Generator().manual_seed(1)).tolist()
-    visits, slots = torch.zeros(300, dtype=torch.int32), torch.zeros(300, dtype=torch.int32)
-    launch(visit, 300, [], [view(visits, wp.int32), view(slots, wp.int32)], device=CPU, slots=True, order=order)
-    assert (visits == 1).all()
-
-
 @pytest.mark.parametrize("threads", [2, 3, 16])
 @pytest.mark.parametrize("count", [256, 1200, 6250, 1_000_003])
 def test_chunks_shrink_towards_the_end(threads: int, count: int) -> None:
@@ -63,3 +54,14 @@ def test_chunks_shrink_towards_the_end(threads: int, count: int) -> None:
 
 def test_chunks_of_a_given_length_keep_it() -> None:
     assert launcher._chunks(10, 2, 4) == ((0, 4), (4, 4), (8, 2))
+
+
+def test_arguments_of_another_type_are_refused() -> None:
+    whole, flat = torch.zeros(4, dtype=torch.int32), view(torch.zeros(4), wp.float32)
+    square = view(torch.zeros(2, 2, dtype=torch.int32), wp.int32)
+    for wrong, message in (
+        (flat, "visits: expected int32 in 1 dimensions, got float32"),
+        (square, "got int32 in 2 dim"),
+    ):
+        with pytest.raises(TypeError, match=message):
+            launch(visit, 4, [], [wrong, view(whole, wp.int32)], device=CPU, slots=True)

@@ -6,13 +6,12 @@ import math
 from dataclasses import dataclass
 from typing import Any
 
-import numpy as np
 import torch
 import warp as wp
 from torch import Tensor
 from torch.nn.functional import pad
 
-from sgwarp.kernels.binning_lanes import PATCH
+from sgwarp.kernels.binning_lanes import PATCH, order_patches
 from sgwarp.kernels.compositing import lanes_backward as compositing_lanes_backward
 from sgwarp.kernels.compositing.lanes_backward import MOMENTS, row_columns
 from sgwarp.kernels.native import GROUP
@@ -29,7 +28,7 @@ from sgwarp.ops.splatting.settings import RasterSettings
 from sgwarp.scene import Camera, Gaussians
 
 TOGETHER = 4  # slices of 16 channels up to which the features' gradient comes with the geometry's
-CHUNKS = 32  # of patches for a thread: few patches hold many splats; where there are few, each is one
+CHUNKS = 32  # of patches for a thread: few patches hold many splats
 
 
 @dataclass(frozen=True, eq=False)
@@ -76,7 +75,16 @@ def replay(
     row_count = int(lists.row_ranges[-1, 0])
     shape = (row_count, slices.shape[1], LANE) if wide and slices.shape[1] <= TOGETHER else (0, 0, LANE)
     rows = scratch("backward rows", row_count * LANE, torch.float32, device).view(-1, LANE)
-    used = scratch("rows in use", row_count, torch.uint8, device).zero_()
+    used = scratch("rows in use", row_count, torch.uint8, device)
+    patches = _patch_count(camera)
+    order = view(scratch("patches", patches, torch.int32, device), wp.int32)
+    launch(
+        order_patches,
+        1,
+        [view(lists.offsets, wp.int32), camera.width, camera.height],
+        [order, view(used, wp.uint8)],
+        device=device,
+    )
     feature_rows = scratch("feature rows", math.prod(shape), torch.float32, device).view(shape)
     narrow = v_depth[:0, :0, None] if wide else v_image
     if channels < 3:
@@ -86,15 +94,12 @@ def replay(
     maps += [view((v_depth if depth else v_depth[:0]).contiguous(), wp.float32)]
     gradient = lane_scratch("backward gradient", TILE_ROWS, slices.shape[1] * LANE if wide else 0, device)
     offsets, listed, splats = lists.arrays()
-    inputs = [offsets, listed, view(lists.row_places, wp.int32), splats, view(slices.unsqueeze(2), Lanes), *maps]
+    inputs = [order, offsets, listed, view(lists.row_places, wp.int32), splats, view(slices.unsqueeze(2), Lanes), *maps]
     inputs += [tiles.knobs(settings), camera.width, camera.height, gradient]
     kernel = compositing_lanes_backward.make_composite_backward(wide, depth, absolute)
     outputs = [view(rows, Lanes), view(used, wp.uint8), view(feature_rows, Lanes)]
-    patches, order = _patch_count(camera), None
     chunk = max(1, patches // (CHUNKS * get_threads()))
-    if chunk == 1 and get_threads() > 1:
-        order = _longest_first(lists, camera)
-    launch(kernel, patches, inputs, outputs, device=device, slots=True, chunk=chunk, order=order)
+    launch(kernel, patches, inputs, outputs, device=device, slots=True, chunk=chunk)
     at_depth, *_ = row_columns(wide, depth, absolute)
     return ReplayedRows(lists, rows, used, feature_rows, at_depth if depth else -1)
 
@@ -102,16 +107,6 @@ def replay(
 def _patch_count(camera: Camera) -> int:
     side = tiles.TILE * PATCH
     return -(-camera.width // side) * -(-camera.height // side)
-
-
-def _longest_first(lists: tiles.TileLists, camera: Camera) -> list[int]:
-    """The patches, those with the most intersections first."""
-    columns, down = -(-camera.width // tiles.TILE), -(-camera.height // tiles.TILE)
-    lengths = np.zeros((-(-down // PATCH), PATCH, -(-columns // PATCH), PATCH), np.int64)
-    whole = lengths.reshape(lengths.shape[0] * PATCH, -1)
-    whole[:down, :columns] = np.diff(lists.offsets.numpy()).reshape(down, columns)
-    order: list[int] = lengths.sum(axis=(1, 3)).ravel().argsort(kind="stable")[::-1].tolist()
-    return order
 
 
 def differentiate(

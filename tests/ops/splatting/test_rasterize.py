@@ -1,5 +1,6 @@
 """The rasterizer against the float64 oracle, and against itself in the other schedule and with other thread counts."""
 
+import itertools
 import math
 
 import pytest
@@ -8,6 +9,7 @@ import warp as wp
 
 import sgwarp as sg
 from sgwarp.errors import InputError
+from sgwarp.kernels import binning_lanes
 from sgwarp.ops import arguments, launcher
 from sgwarp.ops.reference import rasterizer as reference
 from sgwarp.ops.splatting import tiles
@@ -329,6 +331,22 @@ def test_inputs_are_checked(make_scene):
         RasterSettings(alpha_min=0.0)
     with pytest.raises(ValueError, match="at least 1"):
         launcher.set_threads(0)
+
+
+@pytest.mark.parametrize(("width", "height"), [(1, 1), (64, 64), (200, 150), (1000, 70)])
+def test_patches_are_ordered_by_their_intersections(width, height):
+    columns, down = -(-width // 16), -(-height // 16)
+    lengths = torch.randint(0, 3000, (down, columns), generator=torch.Generator().manual_seed(4))
+    offsets = torch.nn.functional.pad(lengths.flatten().cumsum(0), (1, 0)).to(torch.int32)
+    across, patches = -(-columns // 4), -(-columns // 4) * -(-down // 4)
+    order, used = torch.full((patches,), -1, dtype=torch.int32), torch.ones(77, dtype=torch.uint8)
+    outputs = [arguments.view(order, wp.int32), arguments.view(used, wp.uint8)]
+    inputs = [arguments.view(offsets, wp.int32), width, height]
+    launcher.launch(binning_lanes.order_patches, 1, inputs, outputs, device=offsets.device)
+    assert sorted(order.tolist()) == list(range(patches))
+    sums = [int(lengths[p // across * 4 :, p % across * 4 :][:4, :4].sum()) for p in order.tolist()]
+    assert all(later <= 1.125 * earlier for earlier, later in itertools.pairwise(sums))
+    assert not used.any()
 
 
 def test_kernels_read_torch_memory_without_a_copy(make_scene):
