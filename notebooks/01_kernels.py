@@ -392,8 +392,8 @@ def batch():
 
 
 def composite(lists):
-    """Colours, transmittance, sum of alpha T z and the depth of the surface."""
-    outputs = [wp.zeros((HEIGHT, WIDTH), dtype=kind) for kind in (wp.vec3, float, float, float)]
+    """Colours, transmittance, accumulated opacity, sum of alpha T z and the depth of the surface."""
+    outputs = [wp.zeros((HEIGHT, WIDTH), dtype=kind) for kind in (wp.vec3, float, float, float, float)]
     state = wp.zeros((1, 16, 6), dtype=Lanes)
     inputs = [0, 0, lists["offsets"], lists["listed"], lists["splats"], knobs, WIDTH, HEIGHT, state, *batch()]
     wp.launch(compositing_lanes.make_composite_colors(True, False), TILES, inputs, [*outputs, None, None])
@@ -405,10 +405,10 @@ def over_backdrop(image, transmittance):
     return image + transmittance[..., None] * np.linspace((0.80, 0.86, 0.93), (0.97, 0.97, 0.96), HEIGHT)[:, None]
 
 
-image, transmittance, depth_sum, surface = composite(lists)
+image, transmittance, accumulated, depth_sum, surface = composite(lists)
 fig, axes = plt.subplots(1, 2, figsize=(11, 3.6))
 show(axes[0], over_backdrop(image, transmittance), "colour, over a backdrop seen through what is left of T")
-show(axes[1], 1 - transmittance, "accumulated opacity 1 - T", cmap="gray", vmin=0, vmax=1)
+show(axes[1], accumulated, "accumulated opacity 1 - T", cmap="gray", vmin=0, vmax=1)
 plt.show()
 
 # %% [markdown]
@@ -466,7 +466,7 @@ plt.show()
 
 # %%
 covered = transmittance < 0.5
-expected = np.divide(depth_sum, 1 - transmittance, out=np.full_like(depth_sum, np.nan), where=covered)
+expected = np.divide(depth_sum, accumulated, out=np.full_like(depth_sum, np.nan), where=covered)
 seen_depth = np.where(covered, surface, np.nan)
 fig, axes = plt.subplots(1, 2, figsize=(11, 3.5))
 show(axes[0], seen_depth, "depth of the surface [m]", cmap="viridis_r")
@@ -490,14 +490,14 @@ kept_offsets, kept_lists = wp.array(starts([len(piece) for piece in kept])), wp.
 moved = lists["splats"].numpy().copy()
 moved["mean"] -= (240, 112)
 
-block = [wp.zeros((80, 160), dtype=kind) for kind in (wp.vec3, float, float, float)]
+block = [wp.zeros((80, 160), dtype=kind) for kind in (wp.vec3, float, float, float, float)]
 kernel = compositing_block.make_composite_colors_block(True, False)
 wp.config.enable_cpu_blocks = True
 inputs = [kept_offsets, kept_lists, wp.array(moved, dtype=Splat), knobs, 160, 80]
 wp.launch_tiled(kernel, dim=[len(kept)], inputs=inputs, outputs=[*block, None, None], block_dim=256)
 wp.config.enable_cpu_blocks = False
 
-lanes = (image, transmittance, depth_sum, surface)
+lanes = (image, transmittance, accumulated, depth_sum, surface)
 pairs = [(lane[crop], other.numpy()) for lane, other in zip(lanes, block, strict=True)]
 lane_block_difference = max(float(np.abs(lane - other).max()) for lane, other in pairs)
 fig, axes = plt.subplots(1, 3, figsize=(11, 2.3))
@@ -531,13 +531,12 @@ def in_lanes(values):
 def composite_features(lists, features):
     """Blend up to 16 channels per Gaussian, [N, C], into an image [H, W, C]."""
     blended = wp.zeros((HEIGHT, WIDTH, features.shape[1]), dtype=float)
-    transmittance = wp.zeros((HEIGHT, WIDTH), dtype=float)
+    transmittance, accumulated = (wp.zeros((HEIGHT, WIDTH), dtype=float) for _ in range(2))
     scratch = [wp.zeros((1, 16, 17), dtype=Lanes), *batch()]
     slices = in_lanes(features).reshape((N, 1, 1))
     inputs = [0, 0, lists["offsets"], lists["listed"], lists["splats"], slices, 0, knobs, WIDTH, HEIGHT, *scratch]
-    wp.launch(
-        compositing_lanes_features.make_composite_features(1, False), TILES, inputs, [blended, transmittance, None]
-    )
+    outputs = [blended, transmittance, accumulated, None]
+    wp.launch(compositing_lanes_features.make_composite_features(1, False), TILES, inputs, outputs)
     return blended.numpy()
 
 
@@ -667,7 +666,7 @@ for k in range(VIEWS):
     features = noisy_features(classes)
     sums, weight = lift_dense(lists, features, classes >= 0)
     feature_sum, weight_sum = feature_sum + sums, weight_sum + weight
-    centers_seen |= seen_centers(*projected[:2], composite(lists)[3])
+    centers_seen |= seen_centers(*projected[:2], composite(lists)[4])
     for name, seen in zip(coverage, (weight_sum > 0, weight_sum > 0.1, centers_seen), strict=True):
         coverage[name].append(float(seen[showable].mean()))
     if k == 0:

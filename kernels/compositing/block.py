@@ -106,6 +106,7 @@ def make_composite_colors_block(depth: bool, record: bool) -> wp.Kernel:
         # Out:
         colors_out: wp.array2d[wp.vec3],  # [H, W] sum of alpha T color
         transmittance_out: wp.array2d[float],  # [H, W]
+        alpha_out: wp.array2d[float],  # [H, W] accumulated opacity, 1 - transmittance
         depth_sum_out: wp.array2d[float],  # [H, W] sum of alpha T z [m] (depth)
         surface_out: wp.array2d[float],  # [H, W] z where accumulated opacity passes alpha_d [m], 0 = no hit (depth)
         last_out: wp.array2d[int],  # [H, W] last contributor, counted from its tile's first, -1 = none (record)
@@ -121,6 +122,7 @@ def make_composite_colors_block(depth: bool, record: bool) -> wp.Kernel:
         if inside:
             colors_out[y, x] = color
             transmittance_out[y, x] = wp.abs(T)
+            alpha_out[y, x] = 1.0 - wp.abs(T)
             if wp.static(record):
                 last_out[y, x] = latest
             if wp.static(depth):
@@ -208,6 +210,7 @@ def make_composite_features_block(record: bool) -> wp.Kernel:
         # Out:
         features_out: wp.array3d[float],  # [H, W, C] sum of alpha T x
         transmittance_out: wp.array2d[float],  # [H, W]
+        alpha_out: wp.array2d[float],  # [H, W] accumulated opacity, 1 - transmittance
         last_out: wp.array2d[int],  # [H, W] last contributor, counted from its tile's first, -1 = none (record)
     ):
         """Paper eq. 1 for any number of channels; one block per (tile, slice)."""
@@ -221,6 +224,7 @@ def make_composite_features_block(record: bool) -> wp.Kernel:
             write_channels(total, y, x, s, features_out)
             if s == 0:
                 transmittance_out[y, x] = wp.abs(T)
+                alpha_out[y, x] = 1.0 - wp.abs(T)
                 if wp.static(record):
                     last_out[y, x] = latest
 

@@ -140,6 +140,7 @@ def make_composite_colors(depth: bool, record: bool) -> wp.Kernel:
         # Out:
         colors_out: wp.array2d[wp.vec3],  # [H, W] sum of alpha T color
         transmittance_out: wp.array2d[float],  # [H, W]
+        alpha_out: wp.array2d[float],  # [H, W] accumulated opacity, 1 - transmittance
         depth_sum_out: wp.array2d[float],  # [H, W] sum of alpha T z [m] (depth)
         surface_out: wp.array2d[float],  # [H, W] z where accumulated opacity passes alpha_d [m], 0 = no hit (depth)
         last_out: wp.array2d[int],  # [H, W] last contributor, counted from its tile's first, -1 = none (record)
@@ -153,7 +154,7 @@ def make_composite_colors(depth: bool, record: bool) -> wp.Kernel:
         walk(tile, slot, offsets, listed, splats, knobs, width, height, state, batch, reached)
         for row in range(wp.min(TILE, height - y0)):
             inside = wp.min(LANES, width - x0)
-            write_row(slot, row, y0 + row, x0, inside, state, colors_out, transmittance_out)
+            write_row(slot, row, y0 + row, x0, inside, state, colors_out, transmittance_out, alpha_out)
         if wp.static(record):
             write_last(slot, x0, y0, width, height, state, last_plane, last_out)
         if wp.static(depth):

@@ -74,7 +74,9 @@ WRITE = """
     const Row* const row_state = reinterpret_cast<const Row*>(state.data + (slot * 16 + row) * state.shape[2]);
     const Row T = __builtin_elementwise_abs(row_state[0]);
     const int width = features_out.shape[1], channels = features_out.shape[2];
-    for (int i = 0; i < inside; ++i) transmittance_out.data[y * width + x0 + i] = T[i];
+    float* const left = transmittance_out.data + y * width + x0;
+    float* const held = alpha_out.data + y * width + x0;
+    for (int i = 0; i < inside; ++i) left[i] = T[i], held[i] = 1.0f - T[i];
     for (int s = 0; s < SLICES; ++s) {
         Row square[16];
 #pragma clang loop unroll(full)
@@ -167,6 +169,7 @@ def feature_writer(slices: int) -> wp.Function:
         state: wp.array3d[Lanes],
         features_out: wp.array3d[float],  # [H, W, C]
         transmittance_out: wp.array2d[float],  # [H, W]
+        alpha_out: wp.array2d[float],  # [H, W]
     ): ...
 
     return write_row
@@ -197,6 +200,7 @@ def make_composite_features(slices: int, record: bool) -> wp.Kernel:
         # Out:
         features_out: wp.array3d[float],  # [H, W, C] sum of alpha T x
         transmittance_out: wp.array2d[float],  # [H, W]
+        alpha_out: wp.array2d[float],  # [H, W] accumulated opacity, 1 - transmittance
         last_out: wp.array2d[int],  # [H, W] last contributor, counted from its tile's first, -1 = none (record)
     ):
         """Paper eq. 1 for any number of channels."""
@@ -207,7 +211,7 @@ def make_composite_features(slices: int, record: bool) -> wp.Kernel:
         walk(tile, slot, offsets, listed, splats, features, first_slice, knobs, width, height, state, batch, reached)
         inside = wp.min(LANES, width - x0)
         for row in range(wp.min(TILE, height - y0)):
-            write_row(slot, row, y0 + row, x0, inside, first_slice, state, features_out, transmittance_out)
+            write_row(slot, row, y0 + row, x0, inside, first_slice, state, features_out, transmittance_out, alpha_out)
         if wp.static(record):
             write_last(slot, x0, y0, width, height, state, wp.static(1 + PASS * slices), last_out)
 

@@ -44,9 +44,10 @@ WRITE = """
     const Row T = __builtin_elementwise_abs(row_state[0]);
     float* const rgb = reinterpret_cast<float*>(colors_out.data + pixel);
     float* const left = transmittance_out.data + pixel;
+    float* const held = alpha_out.data + pixel;
     for (int i = 0; i < inside; ++i) {
         rgb[3 * i] = row_state[1][i], rgb[3 * i + 1] = row_state[2][i], rgb[3 * i + 2] = row_state[3][i];
-        left[i] = T[i];
+        left[i] = T[i], held[i] = 1.0f - T[i];
     }
 """
 
@@ -131,6 +132,7 @@ def write_row(
     state: wp.array3d[Lanes],  # [slots, 16, planes]
     colors_out: wp.array2d[wp.vec3],  # [H, W]
     transmittance_out: wp.array2d[float],  # [H, W]
+    alpha_out: wp.array2d[float],  # [H, W]
 ): ...
 
 

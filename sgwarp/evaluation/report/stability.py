@@ -140,9 +140,8 @@ def _render(
     projected = tiles.project(gaussians, camera, settings, degree=plan.colored)
     order = tiles.depth_order(projected)
     lists = tiles.bin_splats(projected, order, packed_colors(gaussians, camera, None, order, plan), camera)
-    image, transmittance, depth_sum, surface = composite(lists, camera, settings, None, True, schedule)
-    image, transmittance, depth_sum, surface = (t.cpu() for t in (image, transmittance, depth_sum, surface))
-    alpha = 1.0 - transmittance
+    image, _, alpha, depth_sum, surface = composite(lists, camera, settings, None, True, schedule)
+    image, alpha, depth_sum, surface = (t.cpu() for t in (image, alpha, depth_sum, surface))
     return image, alpha, depth_sum / alpha.clamp(min=1e-12), surface, tiles.culled(projected.counts())
 
 

@@ -142,16 +142,16 @@ class _CompositeSplats(torch.autograd.Function):
             lists = tiles.bin_splats(projected, order, colors, camera, places=keep, rows=keep, keep=keep)
         job.lists = lists
         if not keep:
-            image, transmittance, depth_sum, _ = composite(lists, camera, settings, values, job.wants_depth)
-            return image, transmittance, 1.0 - transmittance, depth_sum
-        image, transmittance, depth_sum, _, last, hit = composite_recorded(
+            image, transmittance, alpha, depth_sum, _ = composite(lists, camera, settings, values, job.wants_depth)
+            return image, transmittance, alpha, depth_sum
+        image, transmittance, alpha, depth_sum, _, last, hit = composite_recorded(
             lists, camera, settings, values, job.wants_depth
         )
         recorded = (transmittance, last, hit)
         ctx.save_for_backward(means2d, factors, opacities, features, depths, *recorded, *vars(lists).values())
         ctx.job = job
         ctx.set_materialize_grads(False)
-        return image, transmittance, 1.0 - transmittance, depth_sum
+        return image, transmittance, alpha, depth_sum
 
     @staticmethod
     @torch.autograd.function.once_differentiable

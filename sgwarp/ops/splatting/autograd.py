@@ -268,7 +268,7 @@ class _Rasterize(torch.autograd.Function):
             keep=True,
             room=request.room,
         )
-        image, transmittance, depth_sum, surface, last, hit = composite_recorded(
+        image, transmittance, alpha, depth_sum, surface, last, hit = composite_recorded(
             lists, camera, settings, features, request.plan.depth, request.schedule
         )
         request.status_counts = projected.counts()
@@ -279,7 +279,7 @@ class _Rasterize(torch.autograd.Function):
         ctx.request = request
         ctx.channels = image.shape[2]
         ctx.set_materialize_grads(False)
-        return image, transmittance, 1.0 - transmittance, depth_sum, surface
+        return image, transmittance, alpha, depth_sum, surface
 
     @staticmethod
     @torch.autograd.function.once_differentiable

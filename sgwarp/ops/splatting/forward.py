@@ -108,10 +108,9 @@ def rasterize(
     order = tiles.depth_order(projected)
     colors = packed_colors(gaussians, camera, features, order, plan)
     lists = tiles.bin_splats(projected, order, colors, camera, room=room)
-    image, transmittance, depth_sum, surface = composite(lists, camera, settings, features, plan.depth)
+    image, transmittance, alpha, depth_sum, surface = composite(lists, camera, settings, features, plan.depth)
     if background is not None:
         image = image + transmittance[..., None] * background.to(image)
-    alpha = 1.0 - transmittance
     mean_depth = None
     if expected_depth:
         mean_depth = torch.where(alpha > 0, depth_sum / alpha.clamp(min=1e-12), 0.0)
@@ -157,8 +156,8 @@ def composite(
     features: Tensor | None,
     wants_depth: bool,
     schedule: str | None = None,
-) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-    """Composite tile lists: image [H, W, C], transmittance, depth sum and surface depth [H, W].
+) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor]:
+    """Composite tile lists: image [H, W, C], transmittance, alpha, depth sum and surface depth [H, W].
 
     `schedule` is "lanes" or "block", by default the device's own; either runs on the CPU.
     """
@@ -173,7 +172,7 @@ def composite_recorded(
     features: Tensor | None,
     wants_depth: bool,
     schedule: str | None = None,
-) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor, Tensor]:
+) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor]:
     """`composite` and what its backward pass starts from, int32 [H, W] each.
 
     `last` is the last contributor, counted from the first of its tile; `hit` is the Gaussian that gave the
@@ -199,22 +198,22 @@ def _composite(
     schedule: str | None,
     last: Tensor,
     hit: Tensor,
-) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor]:
     device = lists.order.device
     block = runs_in_blocks(device, schedule)
     height, width = camera.size
-    transmittance = torch.empty(height, width, device=device)
+    transmittance, alpha = torch.empty(height, width, device=device), torch.empty(height, width, device=device)
     wide = features is not None and features.shape[1] > 3
     depth_shape = (height, width) if wants_depth else (0, 0)
     depth_sum, surface = torch.empty(depth_shape, device=device), torch.empty(depth_shape, device=device)
     image = None
     if wide:
         assert features is not None
-        image = _composite_wide(lists, camera, settings, features, transmittance, last, block)
+        image = _composite_wide(lists, camera, settings, features, transmittance, alpha, last, block)
     if not wide or wants_depth:
         colors = torch.empty(height, width, 3, device=device)
         inputs = [*lists.arrays(), tiles.knobs(settings), width, height]
-        outputs = [view(colors, wp.vec3), *(view(t, wp.float32) for t in (transmittance, depth_sum, surface))]
+        outputs = [view(colors, wp.vec3), *(view(t, wp.float32) for t in (transmittance, alpha, depth_sum, surface))]
         outputs += [view(last, wp.int32), view(hit, wp.int32)]
         record = len(last) > 0
         if block:
@@ -229,7 +228,7 @@ def _composite(
         if image is None:
             image = colors if features is None else colors[..., : features.shape[1]]
     assert image is not None
-    return image, transmittance, depth_sum, surface
+    return image, transmittance, alpha, depth_sum, surface
 
 
 TILE_ROWS = 16
@@ -267,6 +266,7 @@ def _composite_wide(
     settings: RasterSettings,
     features: Tensor,
     transmittance: Tensor,
+    alpha: Tensor,
     last: Tensor,
     block: bool,
 ) -> Tensor:
@@ -276,7 +276,7 @@ def _composite_wide(
     slices = in_slices(features)
     count = slices.shape[1]
     tail = [tiles.knobs(settings), width, height]
-    outputs = [view(image, wp.float32), view(transmittance, wp.float32), view(last, wp.int32)]
+    outputs = [view(t, wp.float32) for t in (image, transmittance, alpha)] + [view(last, wp.int32)]
     record = len(last) > 0
     if block:
         kernel = compositing_block.make_composite_features_block(record)

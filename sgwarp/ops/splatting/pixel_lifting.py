@@ -32,7 +32,7 @@ def add_centers(
 ) -> None:
     """Add the feature at the pixel of each centre, where the rendered depth agrees (paper, Sec. III-B)."""
     device = sums.weight.device
-    surface = composite(lists, camera, settings, None, True)[3]
+    surface = composite(lists, camera, settings, None, True)[4]
     n = len(sums.weight)
     pixels = scratch("center pixels", n, torch.int32, device)
     inputs = [projected.splats, view(projected.status, wp.uint8), view(surface, wp.float32), tau, border]
