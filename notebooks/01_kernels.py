@@ -220,7 +220,8 @@ first_pose, second_pose = pose(-62), pose(38, elevation=30)
 def project(camera):
     splats, status, depths = wp.zeros(N, dtype=Splat), wp.zeros(N, dtype=wp.uint8), wp.zeros(N, dtype=float)
     inputs = [0, means, rotations, deviations, opacity, coefficients, -1, camera, knobs]  # -1: no colours yet
-    wp.launch(projection_lanes.project_groups, -(-N // GROUP), inputs, [splats, status, depths])
+    invalid = wp.zeros(1, dtype=int)  # set if some scale is negative, or an opacity outside [0, 1]
+    wp.launch(projection_lanes.project_groups, -(-N // GROUP), inputs, [splats, status, depths, invalid])
     return splats, status, depths
 
 
@@ -321,7 +322,8 @@ def bin_splats(camera, splats, status, depths):
     sizes = [count, WIDTH, HEIGHT]
     spans = wp.zeros(2 * count, dtype=wp.uint64)  # columns that a splat touches, kept for filling the lists
     rows, patches = wp.zeros(count, dtype=int), wp.zeros(count, dtype=int)  # the tile rows; for gradients
-    outputs = [ordered, cursors, totals, spans, rows, patches]
+    nothing = wp.zeros((0, 2), dtype=int)  # rows of sums: only gradients need them
+    outputs = [ordered, cursors, totals, spans, rows, patches, nothing]
     wp.launch(binning_lanes.count_tiles, 1, [0, order, splats, colors, *sizes], outputs)
     offsets = wp.zeros(TILES + 1, dtype=int)
     wp.launch(binning_lanes.place_slices, 1, [0], [cursors, totals, offsets])
@@ -336,8 +338,7 @@ def bin_splats(camera, splats, status, depths):
         "tiles": tiles,  # [I] tile of each entry
     }
     inputs = [0, order, ordered, *sizes, totals, spans, rows, patches, cursors]
-    nothing = [wp.zeros((0, 2), dtype=int)] * 2  # rows of sums: only gradients need them
-    wp.launch(binning_lanes.fill_tiles, 1, inputs, [listed, lists["entries"], places, tiles, *nothing])
+    wp.launch(binning_lanes.fill_tiles, 1, inputs, [listed, lists["entries"], places, tiles, nothing, nothing])
     return lists
 
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from functools import lru_cache
 from typing import Any
 
 import torch
@@ -19,11 +20,19 @@ def view(tensor: Tensor, dtype: Any) -> Any:
     """The tensor's memory for a kernel, without a copy; vector types take the last dimension."""
     if tensor.is_cuda:
         require_warp(tensor.device)
-    if not tensor.numel():  # torch calls any strides of an empty tensor contiguous, Warp does not
-        tensor = tensor.new_empty(tensor.shape)
-    described = wp.from_torch(tensor, dtype=dtype, requires_grad=False, return_ctype=True)
-    described.dtype = dtype
+    described = Descriptor.from_buffer_copy(_layout(dtype, tensor.dtype, tensor.shape, tensor.stride()))
+    described.data, described._ref, described.dtype = tensor.data_ptr(), tensor, dtype
     return described
+
+
+@lru_cache(maxsize=4096)
+def _layout(dtype: Any, of_tensor: torch.dtype, shape: torch.Size, stride: tuple[int, ...]) -> Any:
+    """The descriptor of such a tensor, without its address; a step asks for the same ones again and again."""
+    if math.prod(shape):
+        tensor = torch.empty_strided(shape, stride, dtype=of_tensor, device="meta")
+    else:  # torch calls any strides of an empty tensor contiguous, Warp does not
+        tensor = torch.empty(shape, dtype=of_tensor, device="meta")
+    return wp.from_torch(tensor, dtype=dtype, requires_grad=False, return_ctype=True)
 
 
 def view_structs(memory: Tensor, dtype: Any, *shape: int) -> Any:
