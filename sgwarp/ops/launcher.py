@@ -6,7 +6,6 @@ threads take chunks in turn; every kernel writes disjoint memory, so the result 
 
 from __future__ import annotations
 
-import copy
 import ctypes
 import itertools
 import os
@@ -16,6 +15,7 @@ from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager, suppress
 from functools import lru_cache
 from typing import Any
+from weakref import WeakKeyDictionary
 
 import torch
 import warp as wp
@@ -29,6 +29,7 @@ from sgwarp.ops.kernel_cache import mended
 CHUNKS_PER_THREAD = 8  # enough to even out tiles of different cost
 SMALLEST_CHUNK = 8  # so much smaller is the last chunk, which the other threads wait for
 MAX_THREADS = 512
+MOST_BOUNDS = 4096  # lengths of launches that are kept
 SMALL = 256  # below this many threads of a launch, a second host thread costs more than it saves
 
 
@@ -124,7 +125,7 @@ def launch(
     """Run a kernel whose first argument is the first index of the launch.
 
     Args:
-        kernel: Takes `base` (and then `slot`, if `slots`) before `inputs`.
+        kernel: Takes arguments named `base` (and then `slot`, if `slots`) before `inputs`.
         count: Number of kernel threads.
         slots: Pass the number of the host thread, which names its scratch; less than `get_threads()`.
         chunk: Kernel threads per host launch, by default an eighth of a host thread's share, and less at the end.
@@ -150,13 +151,19 @@ def launch(
     chunks = _chunks(count, threads, chunk)
     ticket = itertools.count()  # next() is atomic under the interpreter lock
     recorded = mended(kernel, lambda: wp.launch(kernel, count, arguments, device="cpu", record_cmd=True))
+    # Warp's own `Launch.launch` packs every argument anew for each chunk, for which all host threads wait. This calls
+    # the compiled function as that does, with the arguments packed once.
+    run, packed = recorded.hooks.forward, _structure(recorded)(*recorded.params[1:])
+    bounds = [_bounds(recorded, size) for _, size in chunks]
 
     def work(slot: int) -> None:
-        command = _Command(recorded)
+        own = type(packed).from_buffer_copy(packed)
         if slots:
-            command.set_number(1, slot)
+            own.slot = slot
+        pointer = ctypes.byref(own)
         while (number := next(ticket)) < len(chunks) and not unwanted():
-            command.run(*chunks[number])
+            own.base = chunks[number][0]
+            run(bounds[number], pointer)
 
     helpers = [_executor().submit(work, slot) for slot in range(1, threads)]
     try:
@@ -168,38 +175,30 @@ def launch(
         raise Interrupted
 
 
-class _Command:
-    """A recorded launch of the CPU, for one host thread: it has a length and numbers of its own.
-
-    Warp's own `Launch.launch` packs every argument anew each time, for which all host threads wait. This calls the
-    compiled function as that does, with the arguments packed once.
-    """
-
-    def __init__(self, recorded: Any) -> None:
-        self._recorded, self._size = copy.copy(recorded), 0
-        self._recorded.params, self._recorded.fwd_args = list(recorded.params), None
-        values = recorded.params[1:]  # behind the bounds
-        labels = [argument.label for argument in recorded.kernel.adj.args]
-        self._arguments = _structure(tuple(zip(labels, map(type, values), strict=True)))(*values)
-        self._first, self._pointer = labels[0], ctypes.byref(self._arguments)
-
-    def set_number(self, place: int, value: int) -> None:
-        """Set the argument at this place, a number."""
-        setattr(self._arguments, self._recorded.kernel.adj.args[place].label, value)
-
-    def run(self, base: int, size: int) -> None:
-        """Run `size` kernel threads from `base` on."""
-        if size != self._size:
-            self._recorded.set_dim(size)
-            self._size = size
-        setattr(self._arguments, self._first, base)
-        self._recorded.hooks.forward(ctypes.byref(self._recorded.params[0]), self._pointer)
+_structures: WeakKeyDictionary[wp.Kernel, Any] = WeakKeyDictionary()
 
 
-@lru_cache(maxsize=1024)
-def _structure(fields: tuple[tuple[str, Any], ...]) -> Any:
-    """The arguments of a kernel as the compiled function takes them."""
-    return type("Arguments", (ctypes.Structure,), {"_fields_": fields})
+def _structure(recorded: Any) -> Any:
+    """The arguments of a kernel as its compiled function takes them: one behind the other, each of Warp's type."""
+    held = _structures.get(recorded.kernel)
+    if held is None:
+        labels = (argument.label for argument in recorded.kernel.adj.args)
+        fields = list(zip(labels, map(type, recorded.params[1:]), strict=True))  # behind the bounds
+        held = _structures[recorded.kernel] = type("Arguments", (ctypes.Structure,), {"_fields_": fields})
+    return held
+
+
+_bounds_of: dict[int, Any] = {}  # launches of one dimension by their length, as compiled functions take them
+
+
+def _bounds(recorded: Any, size: int) -> Any:
+    held = _bounds_of.get(size)
+    if held is None:
+        recorded.set_dim(size)
+        if len(_bounds_of) >= MOST_BOUNDS:
+            _bounds_of.clear()
+        held = _bounds_of[size] = ctypes.byref(recorded.bounds)
+    return held
 
 
 @lru_cache(maxsize=256)
