@@ -13,7 +13,7 @@ from torch import Tensor
 
 from sgwarp.ops.devices import require_warp, warp_device
 
-Descriptor: Any = type(wp.from_torch(torch.empty(1), return_ctype=True))  # address, shape, strides
+Descriptor: Any = type(wp.from_torch(torch.empty(1, device="cpu"), return_ctype=True))  # address, shape, strides
 
 
 def view(tensor: Tensor, dtype: Any) -> Any:
