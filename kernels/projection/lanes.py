@@ -96,7 +96,6 @@ PROJECT = (
     + """
     const auto magnitude = [](Row x) -> Row { return __builtin_elementwise_abs(x); };
     const auto larger = [](Row x, Row y) -> Row { return x > y ? x : y; };
-    const auto smaller = [](Row x, Row y) -> Row { return x < y ? x : y; };
     const float largest_float = 3.4028234e38f;
 
     // Why each is left out: the first reason that holds.
@@ -111,9 +110,9 @@ PROJECT = (
     const Row length2 = quat[0] * quat[0] + quat[1] * quat[1] + quat[2] * quat[2] + quat[3] * quat[3];
     Row total = magnitude(given[0]) + length2;
     for (int j = 0; j < 3; ++j) total += magnitude(mean[j]) + magnitude(scale[j]);
-    const Row least = smaller(smaller(scale[0], scale[1]), smaller(scale[2], given[0]));
     leave_out(~(total <= largest_float) | ~(length2 >= MIN_NORM2), NON_FINITE);
-    if (bits((least < zero) | (given[0] > 1.0f))) invalid_out.data[0] = 1;  // NaN is not
+    const Ints negative = (scale[0] < zero) | (scale[1] < zero) | (scale[2] < zero) | (given[0] < zero);
+    if (bits(negative | (given[0] > 1.0f))) invalid_out.data[0] = 1;  // NaN is not
     leave_out(given[0] < knobs.alpha_min, TRANSPARENT);
 
     POINT

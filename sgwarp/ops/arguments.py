@@ -11,6 +11,7 @@ import torch
 import warp as wp
 from torch import Tensor
 
+from sgwarp.errors import InputError
 from sgwarp.ops.devices import require_warp, warp_device
 
 Descriptor: Any = type(wp.from_torch(torch.empty(1, device="cpu"), return_ctype=True))  # address, shape, strides
@@ -21,7 +22,8 @@ def view(tensor: Tensor, dtype: Any) -> Any:
     if tensor.is_cuda:
         require_warp(tensor.device)
     described = Descriptor.from_buffer_copy(_layout(dtype, tensor.dtype, tensor.shape, tensor.stride()))
-    described.data, described._ref, described.dtype = tensor.data_ptr(), tensor, dtype
+    described.data, described.dtype = tensor.data_ptr(), dtype
+    described._ref = tensor  # the memory lives as long as the descriptor
     return described
 
 
@@ -42,7 +44,7 @@ def view_structs(memory: Tensor, dtype: Any, *shape: int) -> Any:
     size = wp.types.type_size_in_bytes(dtype)
     strides = [size * math.prod(shape[k + 1 :]) for k in range(len(shape))]
     described = Descriptor(memory.data_ptr(), 0, len(shape), shape, strides)
-    described._ref, described.dtype = memory, dtype  # the memory lives as long as the descriptor
+    described._ref, described.dtype = memory, dtype
     return described
 
 
@@ -52,19 +54,25 @@ def as_array(tensor: Tensor, dtype: Any) -> Any:
     return wp.from_torch(tensor.detach(), dtype=dtype, requires_grad=False)
 
 
-def require_types(kernel: wp.Kernel, arguments: Sequence[Any]) -> None:
-    """Refuse descriptors of another type or dimension than the kernel's parameters; Warp takes them as they are.
+def require_fitting(kernel: wp.Kernel, arguments: Sequence[Any], device: torch.device) -> None:
+    """Refuse descriptors of another type, dimension or device than the launch's; Warp takes them as they are.
 
     Raises:
-        TypeError: Some argument does not fit.
+        InputError: Some tensor is on another device.
+        TypeError: Some argument does not fit its parameter.
     """
     for parameter, value in zip(kernel.adj.args, arguments, strict=False):
-        if type(value) is Descriptor:
-            expected: Any = parameter.type
-            same = value.dtype is expected.dtype or wp.types.types_equal(value.dtype, expected.dtype)
-            if not same or value.ndim != expected.ndim:
-                got = f"{value.dtype.__name__} in {value.ndim} dimensions"
-                raise TypeError(
-                    f"kernel {kernel.key}, {parameter.label}: expected {expected.dtype.__name__} in "
-                    f"{expected.ndim} dimensions, got {got}"
-                )
+        if type(value) is not Descriptor:
+            continue
+        if value._ref.device != device:
+            raise InputError(
+                f"{parameter.label} of {kernel.key}: a tensor on {value._ref.device} where others are on {device}; "
+                "move all to one device"
+            )
+        kind: Any = parameter.type
+        expected = getattr(kind, "dtype", None)
+        same = value.dtype is expected or (expected is not None and wp.types.types_equal(value.dtype, expected))
+        if not same or value.ndim != kind.ndim:
+            wanted = wp.types.type_repr(kind)
+            got = f"{value.dtype.__name__} in {value.ndim} dimensions"
+            raise TypeError(f"kernel {kernel.key}, {parameter.label}: expected {wanted}, got {got}")

@@ -22,7 +22,7 @@ import warp as wp
 from torch import Tensor
 
 from sgwarp.errors import InputError
-from sgwarp.ops.arguments import as_array, require_types
+from sgwarp.ops.arguments import as_array, require_fitting
 from sgwarp.ops.devices import current_stream
 from sgwarp.ops.kernel_cache import mended
 
@@ -139,7 +139,7 @@ def launch(
     if unwanted():
         raise Interrupted
     arguments = [*([0, 0] if slots else [0]), *inputs, *outputs]
-    require_types(kernel, arguments)
+    require_fitting(kernel, arguments, device)
     if device.type == "cuda":
         stream = current_stream(device)
         mended(kernel, lambda: wp.launch(kernel, count, arguments, stream=stream))
@@ -156,21 +156,31 @@ def launch(
     run, packed = recorded.hooks.forward, _structure(recorded)(*recorded.params[1:])
     bounds = [_bounds(recorded, size) for _, size in chunks]
 
-    def work(slot: int) -> None:
+    stopped: list[BaseException] = []
+
+    def work(slot: int, _alive: Any = arguments) -> None:  # the packed arguments are addresses only
         own = type(packed).from_buffer_copy(packed)
         if slots:
             own.slot = slot
         pointer = ctypes.byref(own)
-        while (number := next(ticket)) < len(chunks) and not unwanted():
+        while (number := next(ticket)) < len(chunks) and not stopped and not unwanted():
             own.base = chunks[number][0]
             run(bounds[number], pointer)
 
     helpers = [_executor().submit(work, slot) for slot in range(1, threads)]
     try:
         work(0)
-    finally:
-        for helper in helpers:
-            helper.result()
+    except BaseException as error:
+        stopped.append(error)
+    while helpers:  # also after an interrupt: they still write to the caller's memory
+        try:
+            helpers[-1].result()
+        except BaseException as error:
+            stopped.append(error)
+        if helpers[-1].done():
+            helpers.pop()
+    if stopped:
+        raise stopped[0]
     if unwanted():  # some chunk may have been left out
         raise Interrupted
 
@@ -188,16 +198,17 @@ def _structure(recorded: Any) -> Any:
     return held
 
 
-_bounds_of: dict[int, Any] = {}  # launches of one dimension by their length, as compiled functions take them
+_bounds_of: dict[tuple[int, int], Any] = {}  # by dimensions and length of a launch, as compiled functions take them
 
 
 def _bounds(recorded: Any, size: int) -> Any:
-    held = _bounds_of.get(size)
+    key = (recorded.kernel.adj.kernel_dim, size)
+    held = _bounds_of.get(key)
     if held is None:
         recorded.set_dim(size)
         if len(_bounds_of) >= MOST_BOUNDS:
             _bounds_of.clear()
-        held = _bounds_of[size] = ctypes.byref(recorded.bounds)
+        held = _bounds_of[key] = ctypes.byref(recorded.bounds)
     return held
 
 
@@ -261,7 +272,7 @@ def launch_blocks(
 ) -> None:
     """Run a block-schedule kernel with 256 threads per block; on the CPU the threads are cooperative fibers."""
     arguments = [*inputs, *outputs]
-    require_types(kernel, arguments)
+    require_fitting(kernel, arguments, device)
     tiles: dict[str, Any] = {"dim": list(grid), "inputs": arguments, "block_dim": 256}
     if device.type == "cuda":
         stream = current_stream(device)
@@ -286,7 +297,7 @@ def launch_plain(
     """Run a kernel that takes no `base`, in one launch."""
     if count == 0 or (isinstance(count, tuple) and 0 in count):
         return
-    require_types(kernel, [*inputs, *outputs])
+    require_fitting(kernel, [*inputs, *outputs], device)
     if device.type == "cuda":
         stream = current_stream(device)
         mended(kernel, lambda: wp.launch(kernel, count, inputs, outputs, stream=stream))

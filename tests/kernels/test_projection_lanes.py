@@ -165,6 +165,21 @@ def test_what_no_scene_may_hold_is_noticed(field, value, at):
     assert bool(projected.invalid[0]) == (value < 0 or (field == "opacities" and value > 1))
 
 
+@pytest.mark.parametrize("place", range(3))
+@pytest.mark.parametrize("other", range(4))
+def test_a_negative_scale_beside_nan_is_noticed(place, other):
+    """NaN in another scale or in the opacity of the same Gaussian does not hide it."""
+    scene = cloud(33, 0.05, 1.0, False)
+    scales, opacities = scene.scales.clone(), scene.opacities.clone()
+    scales[20, place] = -1.0
+    if other == 3:
+        opacities[20] = torch.nan
+    elif other != place:
+        scales[20, other] = torch.nan
+    scene = Gaussians.unchecked(scene.means, scene.quats, scales, opacities, scene.sh)
+    assert tiles.project(scene, camera(), RasterSettings()).invalid[0]
+
+
 @pytest.mark.parametrize("n", [0, 1, 5000])
 def test_depth_order(n):
     """By depth, those at the same depth by index; whatever sign, however near."""

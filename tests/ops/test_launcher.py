@@ -1,11 +1,15 @@
 """Cutting a launch into chunks: every kernel thread runs once, whatever the number of host threads."""
 
+import threading
+import time
 from collections.abc import Iterator
+from concurrent.futures import Future
 
 import pytest
 import torch
 import warp as wp
 
+from sgwarp.errors import InputError
 from sgwarp.ops import launcher
 from sgwarp.ops.arguments import view
 from sgwarp.ops.launcher import get_threads, launch, set_threads
@@ -57,11 +61,66 @@ def test_chunks_of_a_given_length_keep_it() -> None:
 
 
 def test_arguments_of_another_type_are_refused() -> None:
-    whole, flat = torch.zeros(4, dtype=torch.int32), view(torch.zeros(4), wp.float32)
-    square = view(torch.zeros(2, 2, dtype=torch.int32), wp.int32)
-    for wrong, message in (
-        (flat, "visits: expected int32 in 1 dimensions, got float32"),
-        (square, "got int32 in 2 dim"),
-    ):
+    whole = view(torch.zeros(4, dtype=torch.int32), wp.int32)
+    flat, square = view(torch.zeros(4), wp.float32), view(torch.zeros(2, 2, dtype=torch.int32), wp.int32)
+    for wrong, message in ((flat, "visits: expected .*int32.*, got float32"), (square, "got int32 in 2 dimensions")):
         with pytest.raises(TypeError, match=message):
-            launch(visit, 4, [], [wrong, view(whole, wp.int32)], device=CPU, slots=True)
+            launch(visit, 4, [], [wrong, whole], device=CPU, slots=True)
+    with pytest.raises(TypeError, match="slot: expected int32, got int32 in 1 dimensions"):
+        launch(visit, 4, [whole], [whole], device=CPU)
+
+
+def test_tensors_of_another_device_are_refused() -> None:
+    elsewhere = torch.zeros(4, dtype=torch.int32, device="meta")
+    with pytest.raises(InputError, match="visits of visit: a tensor on meta where others are on cpu"):
+        launch(visit, 4, [], [view(elsewhere, wp.int32)] * 2, device=CPU, slots=True)
+
+
+class Raised(Exception):
+    pass
+
+
+@pytest.mark.parametrize("at", ["work", "wait"])
+def test_nobody_writes_after_an_exception(at: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    """What interrupts a launch is raised when every host thread has stopped, and the rest of the chunks are left."""
+    set_threads(2)
+    count = 64
+    visits, slots = torch.zeros(count, dtype=torch.int32), torch.zeros(count, dtype=torch.int32)
+    busy, main = [], threading.get_ident()
+
+    class Pool:
+        def submit(self, work, slot):
+            return Helper(work, slot)
+
+    class Helper(Future):
+        def __init__(self, work, slot):
+            super().__init__()
+            self.waits = 0
+            self.thread = threading.Thread(target=self.run, args=(work, slot))
+            self.thread.start()
+
+        def run(self, work, slot):
+            work(slot)
+            busy.append(slot)
+            self.set_result(None)
+
+        def result(self, timeout=None):
+            self.waits += 1
+            if at == "wait" and self.waits == 1:
+                raise Raised  # as a signal handler may
+            return super().result(timeout)
+
+    def unwanted() -> bool:
+        if threading.get_ident() != main:
+            time.sleep(0.01)
+        elif at == "work" and visits.any():
+            raise Raised
+        return False
+
+    monkeypatch.setattr(launcher, "_executor", Pool)
+    with launcher.interruptible(unwanted), pytest.raises(Raised):
+        launch(visit, count, [], [view(visits, wp.int32), view(slots, wp.int32)], device=CPU, slots=True, chunk=1)
+    assert busy == [1], "the helper has ended before the exception comes out"
+    assert visits.max() == 1
+    if at == "work":
+        assert not visits.all()

@@ -121,10 +121,15 @@ def rasterize(
             raise InputError(f"features: expected floating point [{n}, C], got {features.dtype} {list(features.shape)}")
         require_finite_features(features)
     _check_fields(means, quats, scales, opacities)
+    for name, value in (("sh", sh), ("features", features)):
+        if value is not None and value.device != means.device:
+            raise InputError(f"{name}: on {value.device}, means on {means.device}; move them to one device")
     if sh is not None and not (sh.ndim == 3 and len(sh) == n and sh.shape[1] in SH_COUNTS and sh.shape[2] == 3):
         raise InputError(f"sh: expected shape [{n}, 1, 4, 9 or 16, 3], got {list(sh.shape)}")
     camera = Camera(K, viewmat, width, height, near, far)
     if sh is not None and features is not None:
+        if not means.is_cuda and not _plausible(scales, opacities):  # some opacities are set to zero next
+            Gaussians(means, quats, scales, opacities, sh)
         colors, shown = _colors(means, sh, viewmat)
         features, sh = torch.cat([colors, features.to(means)], dim=1), None
         opacities = torch.where(shown, opacities, 0.0)
@@ -189,13 +194,21 @@ def _as_gaussians(*fields: Tensor) -> Gaussians:
 
 
 def _check_fields(means: Tensor, quats: Tensor, scales: Tensor, opacities: Tensor) -> None:
-    """Refuse shapes and types that do not fit; `_check_values` looks at values."""
+    """Refuse shapes, types and devices that do not fit; `_check_values` looks at values."""
     n = len(means)
     fields = {"means": (means, (n, 3)), "quats": (quats, (n, 4)), "scales": (scales, (n, 3))}
     for name, (tensor, shape) in (fields | {"opacities": (opacities, (n,))}).items():
         if tuple(tensor.shape) != shape or not tensor.is_floating_point():
             got = f"{tensor.dtype} {list(tensor.shape)}"
             raise InputError(f"{name}: expected floating point {list(shape)}, got {got}")
+    devices = {str(tensor.device) for tensor, _ in fields.values()} | {str(opacities.device)}
+    if len(devices) > 1:
+        raise InputError(f"means, quats, scales, opacities: on {', '.join(sorted(devices))}; move them to one device")
+
+
+def _plausible(scales: Tensor, opacities: Tensor) -> bool:
+    """Whether no scale is negative and no opacity outside [0, 1]; NaN is neither."""
+    return not bool((scales < 0).any() | (opacities < 0).any() | (opacities > 1).any())
 
 
 def _check_values(gaussians: Gaussians, projected: tiles.Projected) -> None:
