@@ -1,4 +1,6 @@
-"""Launching kernels: host threads on the CPU, torch's current stream on CUDA; memory is in `memory.py`.
+"""Launching kernels: host threads on the CPU, torch's current stream on CUDA.
+
+Their arguments are in `arguments.py`, their memory in `memory.py`, devices in `devices.py`.
 
 A CPU launch of Warp is one serial loop that releases the interpreter lock. So a launch is cut into chunks, and host
 threads take chunks in turn; every kernel writes disjoint memory, so the result does not depend on their number.

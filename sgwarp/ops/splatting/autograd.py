@@ -128,8 +128,8 @@ def rasterize(
         raise InputError(f"sh: expected shape [{n}, 1, 4, 9 or 16, 3], got {list(sh.shape)}")
     camera = Camera(K, viewmat, width, height, near, far)
     if sh is not None and features is not None:
-        if not means.is_cuda and not _plausible(scales, opacities):  # some opacities are set to zero next
-            Gaussians(means, quats, scales, opacities, sh)
+        if not means.is_cuda:
+            Gaussians(means, quats, scales, opacities, sh)  # its checks; some opacities are set to zero next
         colors, shown = _colors(means, sh, viewmat)
         features, sh = torch.cat([colors, features.to(means)], dim=1), None
         opacities = torch.where(shown, opacities, 0.0)
@@ -204,11 +204,6 @@ def _check_fields(means: Tensor, quats: Tensor, scales: Tensor, opacities: Tenso
     devices = {str(tensor.device) for tensor, _ in fields.values()} | {str(opacities.device)}
     if len(devices) > 1:
         raise InputError(f"means, quats, scales, opacities: on {', '.join(sorted(devices))}; move them to one device")
-
-
-def _plausible(scales: Tensor, opacities: Tensor) -> bool:
-    """Whether no scale is negative and no opacity outside [0, 1]; NaN is neither."""
-    return not bool((scales < 0).any() | (opacities < 0).any() | (opacities > 1).any())
 
 
 def _check_values(gaussians: Gaussians, projected: tiles.Projected) -> None:
